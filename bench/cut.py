@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Makes photographs of many cameras out of those of one: each is cut around its middle to 65 to 100 % of its sides and scaled.
+"""Simulates photographs of many cameras from those of one: each is cropped around its centre to 65 to 100 % of its sides and scaled.
 
     python3 -m venv venv && venv/bin/pip install pillow
     venv/bin/python bench/cut.py PHOTOS OUT [--same-size | --beside each|alike] [--seed 1]
 
-Each gets a size of its own, or with --same-size all get 80 % of their first size, so that sizes do not tell cameras apart. With --beside they
-are cut beside their middles and not scaled: each at a place of its own, or all alike to the lower left corner, 75 % of each side. The
-pictures have no metadata; their places are those of PHOTOS.
+Each gets a different size, or with --same-size all get 80 % of their original size, so that sizes do not tell cameras apart. With --beside
+they are cropped off-centre and not scaled: each at a random position, or all to 75 % of each side at the lower left corner. The
+results have no metadata; their camera positions are those of PHOTOS.
 """
 
 import argparse

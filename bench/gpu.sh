@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# gpu.sh: measures everything about the GPU of this machine, and writes it into RESULTS.md between its markers. Needs a driver and Rust;
-# under 8 minutes on a graphics card. DATA=FOLDER names the photographs (fox and others), ../shared/data when absent.
+# gpu.sh: runs all GPU measurements on this machine and writes the figures into RESULTS.md between its markers. Needs a driver and Rust;
+# under 8 minutes on a graphics card. DATA=FOLDER names the photographs (fox and others), ../shared/data by default.
 #
 #   bash bench/gpu.sh
 set -euo pipefail
@@ -21,7 +21,7 @@ irradia=target/release/irradia
     printf '```\n'
 } >"$rows"
 
-# Time to 27 dB on fox at full size, and to the same PSNR with `fast` on both devices.
+# Time to 27 dB on fox at full size on both devices; 1,500 steps of other scenes on the GPU; a hash grid on both devices.
 printf '\n| scene | recipe | device | steps | held-out PSNR dB | seconds of training |\n|---|---|---|---:|---:|---:|\n' >>"$rows"
 run() { # run SCENE DEVICE OPTION..
     local scene="$1" device="$2" out="$scratch/$1-$2"

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# kill.sh PROGRAM DATA [KILLS [OPTION..]]: kills a run with checkpoints at random moments with SIGKILL and resumes it, until it was
-# killed KILLS times (100), and compares its scene with that of an unbroken run. What ends too early begins anew.
+# kill.sh PROGRAM DATA [KILLS [OPTION..]]: kills a run with checkpoints by SIGKILL at random moments and resumes it, until KILLS kills
+# (default 100), and compares its scene with that of an uninterrupted run. A run that finishes before that is started again.
 #
 #   bench/kill.sh target/release/irradia ../shared/data/fox_colmap 100 --steps 300 --downscale 4
 set -euo pipefail
@@ -23,7 +23,7 @@ while [ "$killed" -lt "$kills" ] || [ -e run/run.json ]; do
   if [ -e run/run.json ]; then "$program" train --resume run >log 2>&1 & else "${begin[@]}" run >log 2>&1 & fi
   child=$!
   if [ "$killed" -lt "$kills" ]; then
-    # From at once to half of the whole run.
+    # Between 0 and half the time of the whole run.
     wait_ms=$(( (RANDOM * 32768 + RANDOM) % (whole / 2 + 1) ))
     sleep "$((wait_ms / 1000)).$(printf %03d $((wait_ms % 1000)))"
     if kill -KILL "$child" 2>/dev/null; then killed=$((killed + 1)); fi

@@ -3,8 +3,8 @@
 
     python3 bench/peer_gsplat.py FILE
 
-Needs PyTorch with CUDA, numpy and gsplat. Activations, harmonics of degree 3 and the gradients of all parameters are part of the time; a loss is
-not: the gradient of the image is fixed.
+Needs PyTorch with CUDA, numpy and gsplat. The time includes activations, harmonics of degree 3 and the gradients of all parameters, but
+no loss: the gradient of the image is fixed.
 """
 import struct
 import sys
@@ -16,7 +16,7 @@ from gsplat import rasterization
 from gsplat.optimizers import SelectiveAdam
 
 SECONDS = 1.0
-# Next to nothing, so that the scene stays as it is.
+# Negligible, so that the scene does not change.
 RATE = 1e-12
 
 device = torch.device("cuda")
@@ -57,7 +57,7 @@ def with_backward():
 
 
 def timed(name, work):
-    """Each one waited for, and many in a row."""
+    """Prints the median milliseconds with a synchronisation after each call, and the mean of many calls in a row without."""
     for _ in range(5):
         work()
     torch.cuda.synchronize()

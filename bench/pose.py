@@ -5,9 +5,9 @@
     venv/bin/python bench/pose.py target/release/irradia PHOTOS [PHOTOS ..]
 
 COLMAP runs on the CPU with its defaults (SIFT, exhaustive matching, incremental mapping), one camera for all photographs, with the lens
-model that irradia chose: two lens models differ by more than two programs. Its second run against its first shows how far two runs
-differ; both have the same features. A third one on mirrored photographs, whose features differ as those of two programs do, shows how far
-noise in features goes. AUC@t is the area under the recall of relative poses, the error of a pair
+model that irradia chose, since two lens models differ more than two programs do. A second COLMAP run against the first shows how far two
+runs with the same features differ. A third one, on mirrored photographs, whose features differ as those of two programs do, shows the
+effect of noise in features. AUC@t is the area under the recall of relative poses, the error of a pair
 being the larger of the angles between rotations and between directions of translation, up to t degrees, in per cent; a photograph
 without a pose counts as wrong.
 """
@@ -46,7 +46,7 @@ def run_irradia(program, photos, out):
 
 
 def run_colmap(photos, out, lens):
-    """In a process of its own, whose CPU time can be told."""
+    """Runs COLMAP in a child process, so that its CPU time can be measured."""
     def work():
         child = multiprocessing.get_context("spawn").Process(target=colmap, args=(photos, out, lens))
         child.start()

@@ -1,7 +1,7 @@
-// Whether other programs read what irradia writes, and irradia what they write: npm install; node check.mjs IRRADIA SCENE.ply
+// Checks that other programs read what irradia writes, and vice versa: npm install; node check.mjs IRRADIA SCENE.ply
 //
 // Every format that splat-transform reads is written by irradia, converted to PLY by splat-transform, and compared with the scene
-// splat by splat; every format that it writes is read back by irradia. glb, which it only writes, is compared with its own.
+// splat by splat; every format that it writes is read back by irradia. glb, which splat-transform only writes, is compared with its own.
 
 import { execFileSync } from "node:child_process";
 import { mkdtempSync, readFileSync, rmSync, statSync } from "node:fs";
@@ -21,7 +21,7 @@ const folder = mkdtempSync(join(tmpdir(), "irradia-formats-"));
 const ours = (...files) => execFileSync(irradia, ["convert", ...files], { encoding: "utf8" });
 const theirs = (...files) => execFileSync(process.execPath, [cli, "-q", "-w", "-g", "cpu", ...files], { encoding: "utf8" });
 
-/** Attributes of a .glb of floats by name. */
+/** The attributes of a .glb file of floats, by name. */
 function readGlb(path) {
   const bytes = readFileSync(path);
   const length = bytes.readUInt32LE(12);

@@ -1,4 +1,4 @@
-// Scenes as columns, compared splat by splat.
+// Reads scenes as columns and compares them splat by splat.
 
 import { readFileSync } from "node:fs";
 
@@ -20,7 +20,7 @@ export function readPly(path) {
   return { count, columns };
 }
 
-/** For each splat of a the index of the nearest of b, by position and, among neighbours, colour. */
+/** For each splat of a, the index of the nearest splat of b by position and, among neighbours, by colour and size; -1 for none. */
 function matches(a, b) {
   const cells = new Map();
   const size = 0.02;

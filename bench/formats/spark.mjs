@@ -1,4 +1,4 @@
-// Whether Spark reads what irradia writes: npm install; node spark.mjs IRRADIA SCENE.ply
+// Checks that Spark reads what irradia writes: npm install; node spark.mjs IRRADIA SCENE.ply
 //
 // Spark needs a browser: every file is opened by its SplatMesh in a headless Chromium (CHROMIUM names another one) and compared with
 // the scene splat by splat.
@@ -42,7 +42,7 @@ async function open(name) {
     await tab.goto(address);
     const numbers = await tab.evaluate(async (url) => {
       const { SplatMesh } = await import("@sparkjsdev/spark");
-      // Not the packed form, whose own rounding would be measured.
+      // Not the packed form, since its rounding would be measured too.
       const mesh = new SplatMesh({ url, extSplats: true });
       await mesh.initialized;
       const all = [];
@@ -58,7 +58,7 @@ async function open(name) {
 const SH_C0 = 0.28209479177387814;
 const logit = (v) => Math.log(Math.max(v, 1e-6) / Math.max(1 - v, 1e-6));
 
-/** The same as columns of a PLY. Spark leaves SPZ in its own axes: y and z point the other way. */
+/** These numbers as columns of a PLY. Spark leaves SPZ in its own axes: y and z are flipped. */
 function columnsOf(numbers, flip) {
   const count = numbers.length / 14;
   const column = (at, of = (v) => v) => Float32Array.from({ length: count }, (_, i) => of(numbers[14 * i + at]));
@@ -73,7 +73,7 @@ function columnsOf(numbers, flip) {
 const plain = join(folder, "plain.ply");
 execFileSync(irradia, ["convert", scene, plain]);
 const truth = readPly(plain);
-// No version 4 of SPZ, whose zstd Spark 2.2 takes for gzip.
+// Without version 4 of SPZ: Spark 2.2 mistakes its zstd for gzip.
 const kinds = [["a.ply"], ["a.compressed.ply"], ["a.spz"], ["a.splat"], ["a.ksplat"], ["b.ksplat", "--quality", "high"], ["c.ksplat", "--quality", "low"], ["a.sog"]];
 let failed = 0;
 console.log("written by irradia, read by Spark; mean difference (largest)");

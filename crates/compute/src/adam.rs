@@ -39,28 +39,28 @@ impl AdamStep {
 
 /// Items whose activity is counted together.
 pub const RUN: usize = 512;
-/// Runs of a parallel task.
+/// Items of a parallel task.
 const TASK: usize = 32 * RUN;
 
-/// Which items have a gradient in this step, and what the step does to the others. The flags (length: the stride) are not 0
+/// Which items have a gradient in this step, and what the step does to the others. The flags (length: the stride) are nonzero
 /// where an item has one; elsewhere the gradient is not read.
 #[derive(Clone, Copy, Debug)]
 pub enum Active<'a> {
-    /// The others keep parameters and moments. Also the number of items with a gradient in each [`RUN`]: runs without any are
-    /// skipped whole.
+    /// Items without a gradient keep parameters and moments. The second slice counts the items with a gradient in each [`RUN`];
+    /// runs without any are skipped.
     Sparse(&'a [f32], &'a [u32]),
-    /// The others have a gradient of zero: their moments decay and move them, as in the paper and in 3DGS.
+    /// Items without a gradient step with a gradient of zero: their moments decay and still move them, as in the paper and in 3DGS.
     Dense(&'a [f32]),
-    /// All items have one.
+    /// All items have a gradient.
     All,
 }
 
-/// Learning rates: that of a plane times that of an item.
+/// Learning rates: the product of the plane's and the item's.
 #[derive(Clone, Copy, Debug)]
 pub struct AdamRates<'a> {
-    /// One for each plane; a plane whose rate is 0 rests with its moments.
+    /// One per plane; a plane with rate 0 and its moments stay unchanged.
     pub planes: &'a [f32],
-    /// One for each item (length: the stride); 1 when absent.
+    /// One per item (length: the stride); 1 when absent.
     pub items: Option<&'a [f32]>,
 }
 
@@ -73,7 +73,8 @@ impl<'a> AdamRates<'a> {
 
 /// One step on every plane.
 ///
-/// `parameters`, `gradients` and both `moments` have the same shape. Pieces of planes run in parallel; the result does not depend on how.
+/// `parameters`, `gradients` and both `moments` have the same shape. Planes are processed in parallel, piece by piece; the result does not
+/// depend on the number of threads.
 ///
 /// # Panics
 /// When shapes differ.
@@ -101,7 +102,7 @@ pub fn adam(
     let rated = rates.planes.len() == count && rates.items.is_none_or(|items| items.len() == stride);
     assert!(
         rated && complete,
-        "a rate a plane and an item, a flag an item, a count a run"
+        "a rate per plane and per item, a flag per item, a count per run"
     );
     if stride == 0 {
         return;
@@ -138,7 +139,7 @@ pub fn adam(
         });
 }
 
-/// The constants of a step in lanes.
+/// The constants of a step, broadcast to all lanes.
 #[derive(Clone, Copy, Debug)]
 pub struct AdamRule<L> {
     rate: L,
@@ -182,8 +183,8 @@ impl<L: Lanes<Scalar = f32>> AdamRule<L> {
     }
 }
 
-/// First moments below this are zero: hundreds of steps without a gradient would make them subnormal, which processors are
-/// slow at. The largest move that is lost is 1e-15 of a rate.
+/// First moments below this are set to zero: hundreds of steps without a gradient would make them subnormal, and processors are
+/// slow with subnormal numbers. The largest movement lost is 1e-15 times the rate.
 const FAINTEST_MOMENT: f64 = 1e-30;
 
 struct AdamPiece<'a> {
@@ -278,12 +279,12 @@ mod tests {
         }
     }
 
-    /// Items come and go, each at its own pace, and have no gradient worth reading while they are away; some never come.
+    /// Items have gradients in some steps only, each at its own pace, and NaN in the others; some items never have one.
     fn agrees_with_the_paper(dense: bool) {
         let (n, rate, steps) = (3 * RUN + 37, 0.01, 12);
         // The rate of each item.
         let of_item = |i: usize| [1.0, 0.25, 0.5][i % 3];
-        // The items of the second run never come.
+        // The items of the second run never have a gradient.
         let present = |i: usize, t: u64| i / RUN != 1 && i % 5 != 4 && (t + i as u64).is_multiple_of(1 + i as u64 % 4);
         for level in Level::all() {
             let mut p = Planes::zeros(2, n);

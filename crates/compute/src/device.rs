@@ -12,28 +12,28 @@ use {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum DeviceError {
     /// There is no GPU of the wanted kind.
-    #[error("no GPU {0}; irradia devices lists what is there")]
+    #[error("no GPU {0}; irradia devices lists all devices")]
     None(String),
-    /// This build has no GPU.
-    #[error("this irradia was built without its feature gpu")]
+    /// This build does not support GPUs.
+    #[error("this build of irradia does not have the feature gpu")]
     NotBuilt,
     /// The driver refuses.
     #[error("the GPU {name} cannot be used: {reason}")]
     Refused {
         /// Its name.
         name: String,
-        /// The driver's words.
+        /// The driver's message.
         reason: String,
     },
-    /// It failed at work.
+    /// The device failed after it was opened.
     #[error("the GPU {name} failed: {reason}")]
     Failed {
         /// Its name.
         name: String,
-        /// The driver's words.
+        /// The driver's message.
         reason: String,
     },
-    /// Memory for one array is above what the device binds at once.
+    /// An array is larger than the device can bind.
     #[error(
         "{label} need {needed} MB in one piece, and the GPU {name} binds {limit} MB at most: use fewer splats ({}), smaller photographs \
          (--max-side), or --device cpu",
@@ -42,11 +42,11 @@ pub enum DeviceError {
     TooLarge {
         /// Its name.
         name: String,
-        /// What was to be stored.
+        /// Name of the array.
         label: &'static str,
-        /// Megabytes.
+        /// Its size, megabytes.
         needed: u64,
-        /// Megabytes.
+        /// The largest array that the device binds, megabytes.
         limit: u64,
         /// About how many splats would fit.
         fitting: Option<usize>,
@@ -60,11 +60,11 @@ pub enum DeviceError {
     OutOfMemory {
         /// Its name.
         name: String,
-        /// What was to be stored.
+        /// Name of the array.
         label: &'static str,
-        /// Megabytes.
+        /// Its size, megabytes.
         needed: u64,
-        /// Megabytes.
+        /// Memory in use, megabytes.
         held: u64,
         /// About how many splats would fit.
         fitting: Option<usize>,
@@ -76,7 +76,7 @@ fn max_splats(fitting: &Option<usize>) -> String {
 }
 
 impl DeviceError {
-    /// With the number of splats that would fit, in whole thousands, where `splats` did not: all that is stored grows with them.
+    /// Adds the number of splats that would fit, in whole thousands, given that `splats` did not: memory is proportional to them.
     #[must_use]
     pub fn at_splats(mut self, splats: usize) -> Self {
         let share = |part: u64, whole: u64| splats as u64 * part / whole.max(1);
@@ -84,7 +84,7 @@ impl DeviceError {
             DeviceError::TooLarge {
                 needed, limit, fitting, ..
             } => (fitting, share(*limit, *needed)),
-            // A tenth less than what is in use, since arrays are not all of one size.
+            // A tenth less than the memory in use, since arrays differ in size.
             DeviceError::OutOfMemory {
                 needed, held, fitting, ..
             } => (fitting, share(*held * 9, (*held + *needed) * 10)),
@@ -148,7 +148,7 @@ impl Device {
     /// Opens a device.
     ///
     /// # Errors
-    /// When there is no such GPU, or its driver refuses. [`DeviceChoice::Auto`] takes the CPU then.
+    /// When there is no such GPU, or its driver refuses. [`DeviceChoice::Auto`] falls back to the CPU instead.
     pub fn open(choice: &DeviceChoice) -> Result<Self, DeviceError> {
         #[cfg(feature = "gpu")]
         return match choice {

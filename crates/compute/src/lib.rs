@@ -1,7 +1,7 @@
 //! Shared numerics: SIMD lanes with run-time dispatch, planar arrays, radix sort, nearest neighbours of byte vectors and Adam;
-//! and, with the feature `gpu`, the same on any GPU.
+//! with the feature `gpu`, arrays, kernels, prefix sums and a radix sort on any GPU.
 //!
-//! All `unsafe` code is in `simd` and `nearest`, and a call in `gpu::kernel`.
+//! All `unsafe` code is in `simd` and `nearest`, except for one call in `gpu::kernel`.
 
 pub mod adam;
 mod device;

@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 /// Values of a parallel task.
 const PIECE: usize = 1 << 14;
-/// Values of the smallest page of memory, 4 KiB.
+/// Values in the smallest page of memory, 4 KiB.
 const PAGE: usize = 1 << 10;
 
 /// Sets `to[k]` to `value(order[k])`.
@@ -45,8 +45,8 @@ impl Planes {
         }
     }
 
-    /// `count` planes of `len` unspecified values, whose memory the system has already supplied: it is slow to do so (4.8 s for the 3.5 GB of a
-    /// copy of five million splats in training), and this can happen on a thread beside others.
+    /// `count` planes of `len` unspecified values, whose memory the system has already supplied. Supplying it is slow (4.8 s for the
+    /// 3.5 GB of a copy of five million splats in training), but can be done on a background thread.
     pub fn resident(count: usize, len: usize) -> Self {
         let mut planes = Self::zeros(count, len);
         planes.data.iter_mut().step_by(PAGE).for_each(|first| *first = 1.0);
@@ -112,7 +112,7 @@ impl Planes {
         &mut self.data[c * self.stride..(c + 1) * self.stride]
     }
 
-    /// The first N planes at once, mutable, including padding; beyond the last plane empty slices.
+    /// The first N planes at once, mutable, including padding; slices beyond the last plane are empty.
     pub fn planes_mut<const N: usize>(&mut self) -> [&mut [f32]; N] {
         let mut planes = self.data.chunks_mut(self.stride.max(1));
         std::array::from_fn(|_| planes.next().unwrap_or_default())
@@ -140,7 +140,7 @@ impl Planes {
         self.data[c * self.stride + i] = value;
     }
 
-    /// Gathers the items `indices`, in that order: for cloning, and for what is edited apart from the rest.
+    /// Gathers the items `indices`, in that order: for cloning, and for items that are edited separately.
     pub fn gather(&self, indices: &[u32]) -> Self {
         let mut out = Self::zeros(self.count, indices.len());
         for c in 0..self.count {
@@ -149,9 +149,9 @@ impl Planes {
         out
     }
 
-    /// Replaces the items by `order`, in place, with a single plane of working memory in `scratch`: for pruning, sorting and
-    /// growing. Indices from [`Planes::len`] on count through the items of `added`, one after the other; beyond the last, an item
-    /// is zero.
+    /// Replaces the items by those with the indices `order`, in place, with a single plane of working memory in `scratch`: for
+    /// pruning, sorting and growing. Indices from [`Planes::len`] on refer to the items of `added`, one array after the other; an
+    /// index beyond the last gives zeros.
     ///
     /// # Panics
     /// When the number of planes differs.
@@ -159,13 +159,13 @@ impl Planes {
         assert!(added.iter().all(|other| other.count == self.count), "same components");
         let (old, new) = (self.stride, order.len().next_multiple_of(Self::ALIGN));
         if new > old {
-            // Exact, since half of the state in reserve would cost more than a later move.
+            // Exact, since half a state of spare capacity would cost more than a later move.
             self.data.reserve_exact(self.count * (new - old));
             self.data.resize(self.count * new, 0.0);
         }
         scratch.resize(order.len(), 0.0);
         for turn in 0..self.count {
-            // A plane moves up or down in memory: the order in which none is overwritten before its turn.
+            // Planes move up or down in memory; in this order, none is overwritten before its turn.
             let c = if new > old { self.count - 1 - turn } else { turn };
             let plane = &self.data[c * old..][..self.len];
             let value = |i: usize| {
@@ -253,7 +253,7 @@ mod tests {
         );
     }
 
-    /// Shrinking, keeping and growing, over several pieces, against one item at a time; with 1 and with 2 threads.
+    /// Shrinking, keeping and growing, over several pieces, compared with one item at a time; with 1 and with 2 threads.
     #[test]
     fn rearranging_in_place_gives_what_item_by_item_gives_with_any_number_of_threads() {
         let n = 2 * PIECE + 40;

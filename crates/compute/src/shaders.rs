@@ -1,4 +1,4 @@
-//! The text of the compute shaders, for the feature `gpu` and for others that run WGSL, such as browsers.
+//! The source text of the compute shaders, for the feature `gpu` and for anything else that runs WGSL, such as browsers.
 
 /// `group_index`: the number of a workgroup, for kernels whose workgroups are dispatched in rows.
 pub const GRID: &str = include_str!("gpu/shaders/grid.wgsl");
@@ -8,7 +8,7 @@ pub const ADAM: &str = include_str!("gpu/shaders/adam.wgsl");
 pub const HARMONICS: &str = include_str!("gpu/shaders/harmonics.wgsl");
 const GROUP_SCAN: &str = include_str!("gpu/shaders/scan_group.wgsl");
 
-/// The source of a kernel. Its entry point is `main`, its bindings are those of group 0, in order, all of them used.
+/// The source of a kernel. Its entry point is `main`; its bindings are those of group 0, in order, and all are used.
 #[derive(Clone, Copy, Debug)]
 pub struct Shader {
     /// For messages and tests.
@@ -24,8 +24,8 @@ impl Shader {
     }
 }
 
-/// Declares kernels by name, each with the parts before its own text, `gpu/shaders/NAME.wgsl` beside the file that declares: `SHADERS` has
-/// the source of each, and `Kernels`, with the feature `gpu`, all of them compiled.
+/// Declares kernels by name, each with the parts that precede its own text, the file `gpu/shaders/NAME.wgsl` beside the declaring file.
+/// Defines `SHADERS`, the source of each kernel, and with the feature `gpu` also `Kernels`, all of them compiled.
 #[macro_export]
 macro_rules! kernels {
     ($($(#[$doc:meta])* $name:ident: [$($part:expr),* $(,)?],)*) => {
@@ -44,7 +44,7 @@ macro_rules! kernels {
 
         #[cfg(feature = "gpu")]
         impl Kernels {
-            /// With the text `constants` before each shader's.
+            /// Compiles all kernels, with the text `constants` before each source.
             pub fn new(gpu: &$crate::gpu::Gpu, constants: &str) -> Self {
                 let mut shaders = SHADERS.iter();
                 let mut next = || {
@@ -73,13 +73,13 @@ pub const SCAN: [Shader; 3] = [
     },
 ];
 
-/// Parameters of a sort by the number of keys that the device knows.
+/// Parameters of a sort, from the number of keys on the device.
 pub const SORT_SIZES: Shader = Shader {
     name: "sort_sizes",
     parts: &[include_str!("gpu/shaders/sort_sizes.wgsl")],
 };
 
-/// A pass of the stable radix sort: digits of blocks, the sums before each block, keys to their places.
+/// A pass of the stable radix sort: the counts of digits in each block, their sums before each block, and the scatter of the keys.
 pub const SORT: [Shader; 3] = [
     Shader {
         name: "sort_count",

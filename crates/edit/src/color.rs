@@ -1,8 +1,8 @@
 use crate::Operation;
 use irradia_scene::sh::C0;
 
-/// An affine map of sRGB-encoded colours: `to = matrix from + offset`. It acts on harmonics without loss, except that colours are clamped
-/// at 0 after it, not before.
+/// An affine map of sRGB-encoded colours: `to = matrix from + offset`. It applies to harmonics exactly, except that colours are clamped
+/// at 0 after the map instead of before it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct ColorMap {
     matrix: [[f64; 3]; 3],
@@ -11,9 +11,9 @@ pub(crate) struct ColorMap {
 
 /// Rec. 709 luma.
 const LUMA: [f64; 3] = [0.2126, 0.7152, 0.0722];
-/// By which factor the strongest temperature and tint change a channel.
+/// Ratio of the gain of red to that of blue at a temperature of 1. A tint of 1 divides the gain of green by its square root.
 const STRONGEST: f64 = 1.5;
-/// sRGB is near a power law of this exponent: a stop doubles the light, not the encoded value.
+/// sRGB is close to a power law with this exponent: a stop doubles the light, not the encoded value.
 const GAMMA: f64 = 2.2;
 
 impl ColorMap {
@@ -22,7 +22,7 @@ impl ColorMap {
         offset: [0.0; 3],
     };
 
-    /// Of [`Operation::Recolor`]; of others the identity.
+    /// The map of [`Operation::Recolor`]; the identity for other operations.
     pub fn of(op: &Operation) -> Self {
         let Operation::Recolor {
             exposure,

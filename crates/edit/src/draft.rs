@@ -9,15 +9,15 @@ use std::borrow::Cow;
 pub struct Draft {
     /// The splats, hidden ones included.
     pub cloud: GaussianCloud,
-    /// The training cameras, in the world of `cloud`; empty if they are not known. They follow the whole scene.
+    /// The training cameras, in the world of `cloud`; empty if they are not known. They move with the whole scene.
     pub cameras: Vec<Camera>,
     /// Splats that are neither drawn nor written nor selected.
     pub hidden: Selection,
-    /// Splats that are not selected.
+    /// Splats that cannot be selected.
     pub locked: Selection,
-    /// Splats that the last edit was made of.
+    /// Splats that the last edit was applied to, or those that it added.
     pub last: Selection,
-    /// What the cameras took, as long as the splats that are left are as trained.
+    /// Photographs of the cameras, as long as the remaining splats still match them.
     pub photographs: Option<Photographs>,
 }
 
@@ -80,7 +80,7 @@ impl Draft {
     }
 }
 
-/// The upper median; 0 of nothing.
+/// The upper median; 0 if there are no values.
 pub(crate) fn median(mut values: Vec<f32>) -> f32 {
     let middle = values.len() / 2;
     match values.is_empty() {
@@ -116,7 +116,7 @@ pub(crate) fn gather(cloud: &GaussianCloud, indices: &[u32]) -> GaussianCloud {
     }
 }
 
-/// No splats, in the world of `cloud` and with its degree.
+/// An empty cloud with the world and degree of `cloud`.
 pub(crate) fn empty_like(cloud: &GaussianCloud) -> GaussianCloud {
     GaussianCloud {
         sh_degree: cloud.sh_degree,
@@ -126,12 +126,12 @@ pub(crate) fn empty_like(cloud: &GaussianCloud) -> GaussianCloud {
     }
 }
 
-/// Appends the splats of `other`, which has the same world and degree. What the files of only one of them have for each splat is zero for
-/// those of the other.
+/// Appends the splats of `other`, which has the same world and degree. Extra columns that only one of the two has are zero for the splats
+/// of the other.
 pub(crate) fn append(cloud: &mut GaussianCloud, other: &GaussianCloud) {
     assert_eq!(cloud.sh_degree, other.sh_degree, "clouds of the same degree");
     for column in &other.extra {
-        // A name that has two types has one of them in a file.
+        // A column of the same name but another type is dropped: a file has one type per name.
         if cloud.extra.iter().all(|own| own.name != column.name) {
             cloud.extra.push(column.zeros(cloud.len()));
         }
@@ -146,7 +146,7 @@ pub(crate) fn append(cloud: &mut GaussianCloud, other: &GaussianCloud) {
     cloud.sh.extend_from_slice(&other.sh);
 }
 
-/// Leaves the first `n` splats.
+/// Keeps the first `n` splats.
 pub(crate) fn truncate(cloud: &mut GaussianCloud, n: usize) {
     let width = 3 * cloud.sh_coefficients();
     cloud.means.truncate(n);
@@ -159,7 +159,7 @@ pub(crate) fn truncate(cloud: &mut GaussianCloud, n: usize) {
     }
 }
 
-/// Writes the rows of `from` over the splats `indices`.
+/// Overwrites the splats `indices` with the rows of `from`.
 pub(crate) fn scatter(cloud: &mut GaussianCloud, indices: &[u32], from: &GaussianCloud) {
     let width = 3 * cloud.sh_coefficients();
     for (row, i) in indices.iter().map(|i| *i as usize).enumerate() {

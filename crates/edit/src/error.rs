@@ -1,4 +1,4 @@
-/// Why an edit cannot be read or made: one line that says what, where and what to do.
+/// Why an edit cannot be read or applied: one line that says what, where and what to do.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum EditError {
     /// A list of edits is not TOML, or not of this layout.
@@ -20,10 +20,10 @@ pub enum EditError {
     Value {
         /// The operation or shape and its key.
         name: String,
-        /// What it must be.
+        /// What is allowed.
         message: String,
     },
-    /// An operation and its selection do not fit.
+    /// An operation and its selection do not fit together.
     #[error("{0}")]
     Selection(String),
     /// The cameras are not known.
@@ -32,7 +32,7 @@ pub enum EditError {
     /// Another scene cannot be read.
     #[error("merge: {0}")]
     Source(String),
-    /// The scene itself does not allow it.
+    /// The scene itself does not allow the edit.
     #[error("{0}")]
     Scene(String),
 }

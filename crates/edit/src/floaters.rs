@@ -1,8 +1,9 @@
-//! Floaters: splats in empty space. Every score is free of scale, and 1 is where a splat counts as a floater.
+//! Floaters: splats in empty space. Every score is independent of scale; a splat counts as a floater from a score of 1.
 //!
-//! Support is the heart of it: splats of a surface lie as close together as they are large, so that the distance to the sixth neighbour
-//! is 1.3 to 1.6 of the largest standard deviation in the median of trained scenes and below 4 for 95 % of them. Splats with support draw the depth
-//! that cameras see; one without, in front of that depth, is in empty space. Where cameras are not known, geometry alone decides.
+//! The main criterion is support: the spacing of a surface's splats is about their size. In trained scenes the distance to the sixth
+//! neighbour is 1.3 to 1.6 times the largest standard deviation in the median, and below 4 times for 95 % of the splats. Splats with
+//! support determine the depth that cameras see; a splat without support in front of that depth is in empty space. If cameras are not
+//! known, geometry alone decides.
 
 use crate::draft::median;
 use crate::judge::{Presumption, needed};
@@ -11,53 +12,55 @@ use crate::{Draft, Photographs, Selection, Taken};
 use irradia_splat::{Nearest, sigmoid};
 use rayon::prelude::*;
 
-/// Neighbours by which spacing is measured.
+/// Spacing is the distance to the nearest neighbour of this rank.
 const NEIGHBOURS: usize = 6;
-/// Spacing in units of a splat's size up to which it is part of a surface.
+/// Maximum spacing, in units of its size, of a splat that is part of a surface.
 const SUPPORTED: f32 = 2.0;
 
-/// Spacing in units of size, and of the scene's median spacing, of an isolated splat.
+/// Spacing of an isolated splat, in units of its size and in units of the scene's median spacing.
 const ISOLATED: [f32; 2] = [12.0, 4.0];
-/// Ratio of the largest to the middle standard deviation of a needle, and its length.
+/// Ratio of the largest to the middle standard deviation of a needle, and its size relative to the distance of the nearest camera.
 const NEEDLE: [f32; 2] = [15.0, 0.1];
-/// Size of a huge splat; and of one that is huge among smaller ones, its size in units of spacing: a background's splats are as large as
-/// they are apart.
+/// Size of a huge splat, relative to the distance of the nearest camera.
 const HUGE: f32 = 0.6;
+/// The same for a splat that is huge among smaller ones, and its size in units of spacing: the size of a background's splats is about their
+/// spacing.
 const HUGE_AMONG: [f32; 2] = [0.35, 4.0];
-/// Score from which on photographs decide.
+/// Minimum score at which photographs decide.
 const SUSPICIOUS: f32 = 0.4;
-/// Score of a splat in front of what views show from which on photographs are not asked: the one that it explains would speak for it.
+/// Minimum score of a splat in front of what views show at which photographs are not consulted: the one photograph that the splat explains
+/// would count in its favour.
 const CERTAIN: f32 = 1.5;
-/// Spacing in units of size of a splat that no view shows.
+/// Spacing, in units of its size, of a floater that no view shows.
 const UNSEEN: f32 = 6.0;
-/// Of a splat in front of what views show: the share of views that see past it, its spacing in units of size, the product of both, its
-/// opacity, and the largest sum of its blending weights as a share of a picture's pixels. Fainter and smaller ones are many, do no harm, and in a forward-facing capture
-/// of leaves are leaves.
+/// Minimum values for a splat in front of what views show: the share of views that see past it, its spacing in units of its size, the
+/// product of both, its opacity, and the largest sum of its blending weights in a view as a share of the view's pixels. Fainter and
+/// smaller splats are numerous and harmless, and in a forward-facing capture of leaves they are leaves.
 const IN_FRONT: [f32; 5] = [0.4, 2.5, 2.0, 0.05, 1e-4];
 
-/// How much each reason speaks for a splat being a floater.
+/// How strongly each reason suggests that a splat is a floater.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct FloaterScores {
-    /// Far from its neighbours, by its own size and by the scene's spacing.
+    /// Far from its neighbours, relative to its own size and to the scene's spacing.
     pub isolated: f32,
     /// Long and thin.
     pub needle: f32,
-    /// Large against the distance of the nearest camera, or against the scene if cameras are not known.
+    /// Large relative to the distance of the nearest camera, or to the scene if cameras are not known.
     pub huge: f32,
-    /// In no view, and apart from its neighbours.
+    /// Seen in no view, and far from its neighbours.
     pub unseen: f32,
     /// In front of what the views show, near a camera or anywhere else in empty space.
     pub in_front: f32,
 }
 
 impl FloaterScores {
-    /// The strongest reason's.
+    /// The score of the strongest reason.
     pub fn score(&self) -> f32 {
         let mut scores = *self;
         scores.reasons().into_iter().fold(0.0, |most, reason| most.max(*reason))
     }
 
-    /// The score of the strongest reason.
+    /// The score of the strongest reason, to be changed.
     fn strongest(&mut self) -> &mut f32 {
         let [first, others @ ..] = self.reasons();
         others
@@ -77,7 +80,7 @@ impl FloaterScores {
     }
 }
 
-/// The scores of every splat; hidden ones have none.
+/// The scores of every splat; those of hidden splats are 0.
 pub fn floater_scores(draft: &Draft) -> Vec<FloaterScores> {
     let cloud = &draft.cloud;
     let shown = draft.visible();
@@ -88,7 +91,7 @@ pub fn floater_scores(draft: &Draft) -> Vec<FloaterScores> {
     let means: Vec<[f32; 3]> = numbers.iter().map(|i| cloud.means[*i as usize]).collect();
     let spacings = spacings(&means);
     let usual = median(spacings.clone()).max(f32::MIN_POSITIVE);
-    // Without cameras, the scene is its own measure.
+    // Without cameras, sizes are relative to the scene.
     let extent = draft.extent() as f32;
     let reach = |mean: [f32; 3]| {
         let eyes = draft
@@ -134,17 +137,17 @@ pub fn floater_scores(draft: &Draft) -> Vec<FloaterScores> {
     scores
 }
 
-/// Photographs decide about huge splats and needles: by its shape alone, a part of a plain wall or of the edge of a table looks like one,
-/// and a veil far behind everything does not. They also decide about what is nearly a floater for other reasons.
+/// Photographs decide about huge splats and needles: by shape alone, part of a plain wall or of a table's edge looks like one, and a veil
+/// far behind everything does not. They also decide about splats that are nearly floaters for other reasons.
 fn ask_photographs(draft: &Draft, taken: &Taken, shown: &Selection, scores: &mut [FloaterScores]) {
     let shape = |scores: &FloaterScores| scores.huge.max(scores.needle);
     let other = |scores: &FloaterScores| scores.isolated.max(scores.unseen).max(scores.in_front);
     let is_certain = |scores: &FloaterScores| scores.isolated.max(scores.unseen).max(scores.in_front / CERTAIN) >= 1.0;
-    // Other floaters would be made up for.
+    // Certain floaters are left out, since the fit of the suspects would compensate for them.
     let mut rest = Selection::of(draft.len(), |i| {
         shown.contains(i) && (!is_certain(&scores[i]) || shape(&scores[i]) >= SUSPICIOUS)
     });
-    // Those that have the shape first, as long as nothing else can give way to them; what they hid is judged in clear air.
+    // First the splats with a suspicious shape, while no other splat can change to make room for them; then what they hid, without them.
     for (least, presumption) in [(1.0, Presumption::Guilty), (SUSPICIOUS, Presumption::Innocent)] {
         let suspects = Selection::of(draft.len(), |i| {
             rest.contains(i) && (shape(&scores[i]) >= least || least < 1.0 && other(&scores[i]) >= SUSPICIOUS)
@@ -163,7 +166,7 @@ fn ask_photographs(draft: &Draft, taken: &Taken, shown: &Selection, scores: &mut
     }
 }
 
-/// What the views say.
+/// Scores splats by the views: whether any sees them, and whether they are in front of what views show.
 fn score_views(draft: &Draft, shown: &Selection, apart: &[f32], scores: &mut [FloaterScores]) {
     let cloud = &draft.cloud;
     // Huge splats and needles would veil everything else.
@@ -201,7 +204,7 @@ fn score_views(draft: &Draft, shown: &Selection, apart: &[f32], scores: &mut [Fl
     }
 }
 
-/// What the views that frame a splat say about it.
+/// Votes of the views whose image contains the splat.
 #[derive(Clone, Copy, Debug, Default)]
 struct Votes {
     /// Views that see past it.
@@ -209,7 +212,7 @@ struct Votes {
     /// Views in which it is where the surface is.
     on_surface: u32,
     seen: bool,
-    /// Its largest share of a picture.
+    /// Its largest share of a view's pixels.
     weight: f32,
 }
 

@@ -6,32 +6,32 @@ use irradia_scene::Rng;
 use irradia_splat::sigmoid;
 use rayon::prelude::*;
 
-/// Planes that are tried, among those through three points that can be the ground.
+/// Number of planes that are scored, among those through three points that can be the ground.
 const TRIALS: usize = 2000;
-/// Three points that are drawn: few of them lie on a plane below all cameras.
+/// Number of triples of points that are drawn: few of them lie on a plane below the cameras.
 const DRAWS: usize = 200_000;
-/// Splats that count, chosen at random in proportion to what they cover: opacity times area.
+/// Number of splats sampled, at random in proportion to opacity times area.
 const SAMPLES: usize = 20_000;
 /// Half the thickness of the plane, as a fraction of the median distance of splats from their centre.
 const THICKNESS: f64 = 0.02;
 /// Cosine of the largest angle between the ground's normal and the cameras' mean up: people tilt their cameras.
 const MOST_TILT: f64 = 0.7;
-/// Largest size that counts, as a fraction of the scene's: the background's splats are huge.
+/// Sizes are clamped to this fraction of the scene's: the background's splats are huge.
 const LARGEST: f64 = 0.05;
-/// The share of splats that a ground has at least.
+/// Minimum share of the sampled splats that a ground contains.
 const LEAST: f64 = 0.05;
 
-/// A plane.
+/// The up direction of a scene, and its ground.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ground {
     /// Unit vector that points up.
     pub up: [f64; 3],
-    /// A point of the ground, if there is a plane.
+    /// A point on the ground; `None` if no plane was found.
     pub point: Option<[f64; 3]>,
 }
 
-/// Finds up and the ground in the coordinates of the dataset: up is near the cameras' mean up, the ground the plane that contains most
-/// opacity and has the cameras above it. Without such a plane, up is that of the cameras. `None` without cameras.
+/// Finds the up direction and the ground in the coordinates of the dataset: up is near the cameras' mean up, and the ground is the plane
+/// that contains the most opacity and has the cameras above it. Without such a plane, up is the cameras' mean up. `None` without cameras.
 pub fn ground(draft: &Draft) -> Option<Ground> {
     if draft.cameras.is_empty() {
         return None;
@@ -106,7 +106,7 @@ fn densest(points: &[DVec3], eyes: &[DVec3], up: DVec3) -> Option<(DVec3, DVec3)
         .collect();
     let score = |plane: &(DVec3, DVec3)| points.iter().filter(|p| is_near(plane, p)).count();
     let scores: Vec<usize> = trials.par_iter().map(score).collect();
-    // The first of equal ones.
+    // The first of those with equal scores.
     let best = (0..trials.len()).max_by_key(|i| (scores[*i], usize::MAX - i))?;
     let mut plane = trials[best];
     for _ in 0..3 {
@@ -119,7 +119,7 @@ fn densest(points: &[DVec3], eyes: &[DVec3], up: DVec3) -> Option<(DVec3, DVec3)
     (score(&plane) as f64 >= LEAST * points.len() as f64).then_some(plane)
 }
 
-/// The plane of least squares, with its normal on the side of `toward`.
+/// The least-squares plane, with its normal on the side of `toward`.
 fn fitted(points: &[DVec3], toward: DVec3) -> Option<(DVec3, DVec3)> {
     if points.len() < 3 {
         return None;

@@ -1,8 +1,8 @@
-//! Rotation of spherical harmonics: the function of direction turns with the splat.
+//! Rotation of spherical harmonics, so that the colours of a splat turn with it.
 //!
 //! Each band is closed under rotation, so that its matrix follows from samples: with the band's basis `b` at enough directions `d`,
 //! `b(d) c' = b(R^-1 d) c` for all `c` is a least-squares problem with an exact solution. In `f64` it agrees with the recursion of
-//! Ivanic and Ruedenberg 1996 to rounding, for whatever signs and order the basis has.
+//! Ivanic and Ruedenberg 1996 to rounding, for any signs and order of the basis.
 
 use glam::{DQuat, DVec3};
 use irradia_scene::sh::{C0, C1, C2, C3};
@@ -11,7 +11,7 @@ use irradia_scene::sh::{C0, C1, C2, C3};
 const MAX_DEGREE: usize = 4;
 /// Basis functions up to [`MAX_DEGREE`].
 const COEFFICIENTS: usize = 25;
-/// Directions at which bands are sampled, more than twice as many as a band has functions.
+/// Number of directions at which bands are sampled, more than twice the number of functions in a band.
 const SAMPLES: usize = 32;
 
 /// Band 4, with the signs of the Inria code's basis as gsplat extends it.
@@ -62,14 +62,14 @@ pub(crate) fn basis(direction: DVec3) -> [f64; COEFFICIENTS] {
 
 /// The matrices by which a rotation maps the coefficients of each band.
 pub(crate) struct BandRotation {
-    /// Of bands 1 to 4, row-major, `[2 l + 1, 2 l + 1]`.
+    /// The matrices of bands 1 to 4, row-major, `[2 l + 1, 2 l + 1]`.
     bands: [Vec<f64>; MAX_DEGREE],
 }
 
 impl BandRotation {
-    /// Of a rotation of the scene.
+    /// The matrices of a rotation of the scene.
     pub fn new(rotation: DQuat) -> Self {
-        // Even over the sphere: a Fibonacci lattice.
+        // Evenly distributed over the sphere: a Fibonacci lattice.
         let directions: Vec<DVec3> = (0..SAMPLES)
             .map(|i| {
                 let z = 1.0 - (2 * i + 1) as f64 / SAMPLES as f64;
@@ -177,7 +177,7 @@ mod tests {
         }
         for (at, value) in gram.iter().enumerate() {
             let expected = f64::from(u8::from(at / COEFFICIENTS == at % COEFFICIENTS));
-            // 1e-3: what the lattice leaves of the integral.
+            // 1e-3: the integration error of the lattice.
             assert!((value - expected).abs() < 1e-3, "{at}: {value}");
         }
     }

@@ -3,7 +3,7 @@ use crate::plan::{Change, Plan};
 use crate::{Applied, Draft, Edit, EditError, EditList, Open, Photographs, Provenance, Selection};
 use irradia_scene::{Camera, GaussianCloud, Similarity};
 
-/// A scene with the edits made on it, which can be undone step by step. Only what an edit changed or removed is kept for that.
+/// A scene and the edits applied to it, which can be undone one by one. Only the splats that an edit changed or removed are kept for that.
 ///
 /// ```
 /// # use irradia_edit::{Draft, History, open_nothing};
@@ -29,7 +29,7 @@ pub struct History {
 }
 
 impl History {
-    /// No edits on a scene.
+    /// A scene without edits.
     pub fn new(draft: Draft) -> Self {
         Self {
             draft,
@@ -38,12 +38,12 @@ impl History {
         }
     }
 
-    /// The scene as the edits left it.
+    /// The scene after the edits.
     pub fn draft(&self) -> &Draft {
         &self.draft
     }
 
-    /// The edits made and not undone, with everything that was found automatically written out.
+    /// The edits applied and not undone, with all automatically determined values filled in.
     pub fn list(&self) -> EditList {
         EditList {
             edits: self.done.iter().map(|(edit, _)| edit.clone()).collect(),
@@ -51,12 +51,12 @@ impl History {
         }
     }
 
-    /// Number of edits that can be made again.
+    /// Number of edits that can be redone.
     pub fn undone(&self) -> usize {
         self.undone.len()
     }
 
-    /// Makes an edit; what was undone is forgotten. If it fails, nothing has changed.
+    /// Applies an edit, after which undone edits can no longer be redone. If it fails, nothing changes.
     ///
     /// # Errors
     /// Those of [`apply`](crate::apply).
@@ -66,7 +66,7 @@ impl History {
         Ok(applied)
     }
 
-    /// Makes the edit again that was undone last; `None` if there is none.
+    /// Redoes the edit that was undone last; `None` if there is none.
     ///
     /// # Errors
     /// Those of [`apply`](crate::apply).
@@ -77,7 +77,7 @@ impl History {
         }))
     }
 
-    /// Undoes the last edit, to the bit. Returns from where the splats come; `None` if there is no edit.
+    /// Undoes the last edit, bit for bit. Returns where the splats come from; `None` if there is no edit.
     pub fn undo(&mut self) -> Option<Provenance> {
         let (edit, undo) = self.done.pop()?;
         self.undone.push(edit);
@@ -93,19 +93,19 @@ impl History {
     }
 }
 
-/// What an edit takes away.
+/// The state that an edit overwrites.
 struct Undo {
     /// Number of splats before.
     len: usize,
-    /// The splats that were changed or removed: their numbers, ascending, and rows.
+    /// The splats that were changed or removed: their indices, ascending, and rows.
     indices: Vec<u32>,
     rows: GaussianCloud,
     removed: bool,
     sh_degree: u32,
-    /// Columns of extra values before.
+    /// Number of extra columns before.
     extra: usize,
     world_from_dataset: Similarity,
-    /// If they were moved.
+    /// The cameras before, if the edit moves them.
     cameras: Option<Vec<Camera>>,
     hidden: Selection,
     locked: Selection,
@@ -148,7 +148,7 @@ impl Undo {
     fn apply(self, draft: &mut Draft) -> Provenance {
         let cloud = &mut draft.cloud;
         let provenance = if self.removed {
-            // Their places, between those that stayed.
+            // Removed splats return to their places between those that stayed.
             let mut sources = vec![Provenance::NEW; self.len];
             let mut removed = Selection::none(self.len);
             self.indices.iter().for_each(|i| removed.set(*i as usize, true));

@@ -1,8 +1,9 @@
-//! What photographs say about suspects: how much of each the scene needs.
+//! Judges suspected floaters by photographs: how much of each suspect's opacity the photographs support.
 //!
-//! The opacities of all suspects together are fitted to the photographs while the rest of the scene stays. One by one they cannot be judged:
-//! a bright veil and a dark one hide each other, and each seems to help. What is invisible has no gradient, so that nothing that vanished in
-//! the fog of a hundred veils would come back: hidden suspects are shown faintly in turns, and tried again in clear air at the end.
+//! The opacities of all suspects are fitted to the photographs together, while the rest of the scene stays fixed. They cannot be judged
+//! one by one: a bright veil and a dark one hide each other, and each seems to help. An invisible splat has no gradient, so that a splat
+//! that vanished in the fog of a hundred veils would never come back: hidden suspects are therefore shown faintly in turns, and tried
+//! again at the end, when the fog is gone.
 
 use crate::draft::gather;
 use crate::{Draft, Selection, Taken};
@@ -11,35 +12,37 @@ use irradia_splat::{
     Gather, OutputGradient, RenderOptions, Renderer, SplatGradients, Splats, ViewParams, logit, sigmoid,
 };
 
-/// Steps of Adam over all photographs where suspects begin hidden, and where they begin as trained; rates at the first step and at the last.
+/// Steps of Adam over all photographs if suspects start hidden, and if they start as trained.
 const STEPS: [usize; 2] = [40, 20];
+/// Learning rates of the first and of the last step.
 const RATES: [f32; 2] = [0.2, 0.02];
-/// Decay of the means of gradients and of their squares. It is short: the fog of the first steps has gradients a thousand times larger than
-/// those by which a wall gets back what it lost in it.
+/// Decay of the means of gradients and of their squares. Their memory is short, because the gradients in the fog of the first steps are a
+/// thousand times larger than those by which a wall regains the opacity that it lost there.
 const DECAY: f32 = 0.8;
-/// Hidden suspects have no gradients. Each is shown faintly in one of so many steps: a hundred veils at once are a fog in which no wall comes back.
+/// Hidden suspects have no gradients. Each is shown faintly in one of this many steps: a hundred veils at once would be a fog in which no
+/// wall comes back.
 const TURNS: usize = 8;
-/// Opacity from which on a splat has gradients: 1/255 in the middle and a little more around.
+/// Minimum opacity at which a splat has gradients: more than the cut-off of 1/255, so that it is drawn around its centre as well.
 const FAINTEST: f32 = 0.012;
-/// Share of its opacity that photographs leave to a splat that they need.
+/// Minimum share of its opacity that the fit leaves to a splat that photographs need.
 const NEEDED: f32 = 0.5;
-/// Share of the error that a splat may add without being condemned: what photographs do not object to stays.
+/// Share of the error that a splat may add without being condemned: splats that photographs do not contradict stay.
 const HARMLESS: f64 = 2e-5;
-/// Condemned splats that are shown faintly at a time to see whether they would help.
+/// Number of condemned splats shown faintly at a time to test whether they would help.
 const GROUP: usize = 8;
-/// Times that all condemned are tried again, as long as any comes back.
+/// Maximum number of times that all condemned splats are tried again; it ends earlier when none comes back.
 const TRIALS: usize = 3;
 
 /// How suspects are judged.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Presumption {
-    /// Hidden, unless photographs ask for them.
+    /// Suspects start hidden and come back if photographs need them.
     Guilty,
-    /// Shown, unless photographs object to them.
+    /// Suspects start as trained and vanish if photographs contradict them.
     Innocent,
 }
 
-/// Whether the photographs need each of `suspects`; `of` is what is rendered.
+/// Whether the photographs need each of `suspects`; `of` are the splats that are rendered, suspects included.
 pub(crate) fn needed(
     draft: &Draft,
     taken: &Taken,
@@ -63,12 +66,12 @@ pub(crate) fn needed(
     suspects.zip(verdicts).collect()
 }
 
-/// The scene before its photographs.
+/// The splats on trial, the photographs, and what is needed to compare them.
 struct Trial<'a> {
     draft: &'a Draft,
     taken: &'a Taken,
     splats: Splats,
-    /// Where each suspect is in `splats`, and its opacity as trained.
+    /// Index of each suspect in `splats`, and its opacity as trained.
     places: Vec<usize>,
     whole: Vec<f32>,
     renderer: Renderer,
@@ -91,18 +94,19 @@ impl<'a> Trial<'a> {
         }
     }
 
-    /// Shows a suspect with a share of its opacity.
+    /// Sets the opacity of a suspect to a share of its trained opacity.
     fn show(&mut self, suspect: usize, share: f32) {
         let opacity = (share * self.whole[suspect]).max(1e-6);
         self.splats.opacity_logits.set(0, self.places[suspect], logit(opacity));
     }
 
-    /// The share with which a suspect is just drawn.
+    /// The share of its opacity at which a suspect is just drawn.
     fn faintest(&self, suspect: usize) -> f32 {
         (FAINTEST / self.whole[suspect]).min(1.0)
     }
 
-    /// Renders every photograph's view. Returns half the sum of squared errors; `after` is called after each view, its errors in `v_color`.
+    /// Renders the view of every photograph. Returns half the sum of squared errors; `after` is called after each view, with its errors in
+    /// `v_color`.
     fn look(&mut self, mut after: impl FnMut(&mut Self)) -> f64 {
         let options = RenderOptions {
             antialias: self.draft.cloud.antialiased,
@@ -130,7 +134,7 @@ impl<'a> Trial<'a> {
         error
     }
 
-    /// The error, and its slope along the share of each suspect.
+    /// The error, and its derivative with respect to each suspect's share.
     fn slopes(&mut self) -> (f64, Vec<f32>) {
         let mut slopes = vec![0.0f32; self.places.len()];
         let error = self.look(|trial| {
@@ -147,20 +151,20 @@ impl<'a> Trial<'a> {
             }
         });
         for ((slope, at), whole) in slopes.iter_mut().zip(&self.places).zip(&self.whole) {
-            // The slope along the logit, without what the sigmoid makes of it.
+            // From the derivative with respect to the logit to that with respect to the share: divides by the sigmoid's slope.
             let opacity = sigmoid(self.splats.opacity_logits.get(0, *at));
             *slope *= whole / ((1.0 - opacity).max(0.01) * opacity);
         }
         (error, slopes)
     }
 
-    /// Fits the shares of all suspects together.
+    /// Fits the shares of all suspects together. Returns whether each is needed.
     fn fit(&mut self, presumption: Presumption) -> Vec<bool> {
         let is_hidden = presumption == Presumption::Guilty;
         let (first, steps) = if is_hidden { (0.0, STEPS[0]) } else { (1.0, STEPS[1]) };
         let mut shares = vec![first; self.places.len()];
         let mut moments = vec![[0.0f32; 2]; shares.len()];
-        // The steps that a suspect's moments know of.
+        // Number of steps that the moments of each suspect cover.
         let mut ages = vec![0; shares.len()];
         let mut harmless = vec![false; shares.len()];
         for (step, turn) in (0..steps).zip((0..TURNS).cycle()) {
@@ -173,7 +177,7 @@ impl<'a> Trial<'a> {
             }
             let (error, slopes) = self.slopes();
             if !is_hidden && step == 0 {
-                // The error falls by no more than half the slope when one vanishes that has its best share at or above 0.
+                // Hiding a suspect whose best share is at or above 0 lowers the error by at most half the slope.
                 harmless = slopes
                     .iter()
                     .map(|slope| f64::from(*slope) < 2.0 * HARMLESS * error)
@@ -195,7 +199,7 @@ impl<'a> Trial<'a> {
         shares.into_iter().zip(harmless).map(is_needed).collect()
     }
 
-    /// Acquits the condemned by which the photographs are met better, the most useful first: late turns leave the fit no time.
+    /// Acquits condemned splats that lower the error, the most useful first: suspects whose turn came late had too few steps in the fit.
     fn acquit(&mut self, verdicts: &mut [bool]) {
         for (i, needed) in verdicts.iter().enumerate() {
             self.show(i, f32::from(u8::from(*needed)));

@@ -1,8 +1,8 @@
 //! Edits of splat scenes as data.
 //!
-//! An [`Edit`] is an [`Operation`] on what some [`SelectStep`]s select; an [`EditList`] is what `edits.toml` holds. All positions are
-//! those of the dataset, so that a list can be replayed on a retrained scene. A [`Draft`] is the scene that is edited;
-//! [`select`] evaluates a selection on it, [`apply`] makes an edit, [`History`] makes and undoes them.
+//! An [`Edit`] is an [`Operation`] on the splats that its [`SelectStep`]s select; an [`EditList`] is the content of `edits.toml`. All
+//! positions are in the dataset's coordinates, so that a list can be replayed on a retrained scene. A [`Draft`] is the scene being
+//! edited; [`select`] evaluates a selection on it, [`apply`] applies an edit, [`History`] applies and undoes edits.
 //!
 //! ```
 //! use irradia_edit::{Draft, Edit, apply, open_nothing, select};

@@ -6,12 +6,12 @@ use serde::{Deserialize, Serialize};
 
 /// The version of the layout that is written and read.
 const VERSION: u32 = 1;
-/// Most edits of a list, and steps of a selection.
+/// Maximum number of edits in a list, and of steps in a selection.
 const MOST: usize = 10_000;
-/// Most bytes of a list.
+/// Maximum size of a list in bytes.
 const MOST_BYTES: usize = 64 << 20;
 
-/// Edits in the order in which they are made. Each has the coordinates of the scene as the edits before it leave it.
+/// Edits in the order of application. Each is in the coordinates of the scene after the edits before it.
 ///
 /// ```
 /// use irradia_edit::EditList;
@@ -48,34 +48,34 @@ pub struct EditList {
 /// An operation on what is selected.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Edit {
-    /// What is done.
+    /// The operation.
     #[serde(flatten)]
     pub op: Operation,
-    /// To which splats, step by step; to the whole scene if absent.
+    /// Steps that select the splats; the whole scene if absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub select: Option<Vec<SelectStep>>,
 }
 
-/// What is done. Hidden and locked splats are not selected, but move with the whole scene.
+/// An operation on splats. Hidden and locked splats are not selected, but move with the whole scene.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "op", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Operation {
     /// Removes the selection.
     Delete {},
-    /// Removes everything else.
+    /// Removes everything but the selection.
     Keep {},
     /// Moves by a vector.
     Move {
         /// The vector.
         by: [f64; 3],
     },
-    /// Rotates about an axis, counter-clockwise for someone whom the axis points at.
+    /// Rotates about an axis, counter-clockwise if the axis points at the viewer.
     Rotate {
         /// The axis.
         axis: [f64; 3],
         /// The angle.
         degrees: f64,
-        /// A point of the axis; if absent the origin for the whole scene, and the selection's centre.
+        /// A point on the axis; if absent, the origin for the whole scene, otherwise the selection's centre.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         about: Option<[f64; 3]>,
     },
@@ -83,7 +83,7 @@ pub enum Operation {
     Scale {
         /// The factor.
         factor: f64,
-        /// The point; if absent the origin for the whole scene, and the selection's centre.
+        /// The point; if absent, the origin for the whole scene, otherwise the selection's centre.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         about: Option<[f64; 3]>,
     },
@@ -100,23 +100,23 @@ pub enum Operation {
     },
     /// Turns the scene so that a direction points up, and moves it so that the ground is at height 0.
     Upright {
-        /// What points up; from the cameras and the densest plane if absent.
+        /// The direction that points up; if absent, found from the cameras and the densest plane.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         up: Option<[f64; 3]>,
-        /// A point of the ground; of the densest plane if absent, and nothing moves if `up` is given alone.
+        /// A point on the ground. If absent, a point of the densest plane; if only `up` is given, the scene turns but does not move.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         ground: Option<[f64; 3]>,
-        /// The axis that points up then.
+        /// The axis that points up afterwards.
         #[serde(default)]
         axis: UpAxis,
     },
     /// Scales the scene about the origin such that a distance becomes known.
     SetLength {
-        /// Its one end.
+        /// One end of the distance.
         from: [f64; 3],
-        /// Its other end.
+        /// The other end.
         to: [f64; 3],
-        /// Its length.
+        /// The distance after scaling.
         length: f64,
     },
     /// Changes colours, in this order: exposure, temperature and tint as gains of the encoded colour, saturation, contrast.
@@ -142,18 +142,18 @@ pub enum Operation {
         /// The factor.
         factor: f64,
     },
-    /// Leaves the splats that matter most.
+    /// Keeps only the most important splats.
     Reduce {
-        /// Their number.
+        /// Number of splats to keep.
         count: usize,
     },
-    /// Neither draws nor writes the selection, until it is shown again.
+    /// Hides the selection: it is neither drawn nor written until it is shown again.
     Hide {},
-    /// Shows what is hidden.
+    /// Shows hidden splats.
     Show {},
-    /// Keeps the selection from being selected.
+    /// Locks the selection: it cannot be selected until it is unlocked.
     Lock {},
-    /// Lets what is locked be selected.
+    /// Unlocks locked splats.
     Unlock {},
     /// Moves the selection into a new scene.
     Split {
@@ -198,7 +198,7 @@ impl Default for EditList {
     }
 }
 
-/// The list before its edits are read one by one, so that an error names the edit.
+/// The list before its edits are read; they are read one by one, so that an error names the edit.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct RawList {
@@ -251,14 +251,14 @@ impl EditList {
         toml::to_string(self).expect("plain data")
     }
 
-    /// Whether every edit is possible on some scene.
+    /// Checks every edit, independently of a scene.
     ///
     /// # Errors
     /// [`EditError::InList`] for the first that is not.
     pub fn check(&self) -> Result<(), EditError> {
         if self.edits.len() > MOST {
             return Err(EditError::List(format!(
-                "it has {} edits, at most {MOST} are made",
+                "it has {} edits, at most {MOST} are allowed",
                 self.edits.len()
             )));
         }
@@ -294,7 +294,7 @@ impl Edit {
         Ok(edit)
     }
 
-    /// Whether every number is in range, and the operation and its selection fit.
+    /// Checks that every number is in range, and that the operation and its selection fit together.
     ///
     /// # Errors
     /// One line that names the key.
@@ -307,14 +307,14 @@ impl Edit {
             }
             (Some(_), Needs::Scene) => {
                 return Err(EditError::Selection(format!(
-                    "{name} is of the whole scene and has no selection"
+                    "{name} applies to the whole scene and takes no selection"
                 )));
             }
             _ => {}
         }
         let steps = self.select.as_deref().unwrap_or_default();
         if steps.len() > MOST {
-            let message = format!("has {} steps, at most {MOST} are made", steps.len());
+            let message = format!("has {} steps, at most {MOST} are allowed", steps.len());
             return Err(EditError::value(format!("{name} select"), message));
         }
         steps.iter().try_for_each(SelectStep::check)?;
@@ -391,7 +391,7 @@ fn within(name: &str, value: f64, low: f64, high: f64) -> Result<(), EditError> 
     }
 }
 
-/// What an operation is made of.
+/// What an operation applies to.
 enum Needs {
     Selection,
     Scene,

@@ -2,7 +2,7 @@ use irradia_scene::Photo;
 use std::fmt::{Debug, Formatter};
 use std::sync::{Arc, LazyLock};
 
-/// Small photographs of a scene, by which the search for floaters judges; they are read when they are first needed, and shared.
+/// Small photographs of a scene, which the search for floaters compares it with; they are shared, and read when they are first needed.
 #[derive(Clone)]
 pub struct Photographs(Arc<Lazy>);
 
@@ -11,19 +11,19 @@ type Lazy = LazyLock<Option<Taken>, Box<dyn FnOnce() -> Option<Taken> + Send>>;
 /// Photographs in memory.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Taken {
-    /// The number of a camera in [`Draft::cameras`](crate::Draft), and what it took, over the background: 3 channels, of any size.
+    /// The index of a camera in [`Draft::cameras`](crate::Draft), and its photograph over the background: 3 channels, of any size.
     pub photos: Vec<(usize, Photo)>,
-    /// What the scene is rendered over, sRGB.
+    /// The background that the scene is rendered over, sRGB.
     pub background: [f32; 3],
 }
 
 impl Photographs {
-    /// Those that `read` returns, `None` if they are not to be had.
+    /// The photographs that `read` returns; `None` if they are not available.
     pub fn new(read: impl FnOnce() -> Option<Taken> + Send + 'static) -> Self {
         Self(Arc::new(LazyLock::new(Box::new(read))))
     }
 
-    /// The photographs, if they are to be had.
+    /// The photographs, if they are available.
     pub fn taken(&self) -> Option<&Taken> {
         self.0.as_ref().as_ref()
     }

@@ -1,4 +1,4 @@
-//! Operations: first everything that may fail, then the change itself.
+//! Operations in two parts: first everything that may fail, then the change itself.
 
 use crate::color::ColorMap;
 use crate::draft::{append, gather};
@@ -19,20 +19,20 @@ pub fn open_nothing(file: &str) -> Result<GaussianCloud, String> {
     Err(format!("{file} cannot be opened here"))
 }
 
-/// From where the splats of an edited scene come.
+/// Where the splats of an edited scene come from.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Provenance {
-    /// For each splat its number before, or [`Provenance::NEW`]; `None` if they are the same splats in the same order.
+    /// For each splat its index before, or [`Provenance::NEW`]; `None` if they are the same splats in the same order.
     pub sources: Option<Vec<u32>>,
-    /// The splats whose numbers differ from those of their source; new ones that are not copies included.
+    /// The splats whose values may differ from those of their source, and all new splats.
     pub changed: Selection,
 }
 
 impl Provenance {
-    /// A splat that was not there.
+    /// The source of a splat that did not exist before.
     pub const NEW: u32 = u32::MAX;
 
-    /// Of a scene of `n` splats in which nothing changed.
+    /// The provenance of `n` splats that did not change.
     pub fn identity(n: usize) -> Self {
         Self {
             sources: None,
@@ -40,7 +40,7 @@ impl Provenance {
         }
     }
 
-    /// The number before of splat `i`, if it was there.
+    /// The index before of splat `i`, if it existed.
     pub fn source(&self, i: usize) -> Option<u32> {
         match &self.sources {
             None => Some(i as u32),
@@ -48,7 +48,7 @@ impl Provenance {
         }
     }
 
-    /// Of this edit and then `next`.
+    /// The provenance of this edit followed by `next`.
     pub fn then(&self, next: &Self) -> Self {
         let n = next.changed.len();
         let changed = Selection::of(n, |i| {
@@ -63,22 +63,23 @@ impl Provenance {
     }
 }
 
-/// What an edit did.
+/// The result of an edit.
 #[derive(Clone, Debug)]
 pub struct Applied {
-    /// The edit with everything that was found automatically written out, so that it can be made again in the same way.
+    /// The edit with all automatically determined values filled in, so that replaying it gives the same result.
     pub edit: Edit,
-    /// From where the splats come.
+    /// Where the splats come from.
     pub provenance: Provenance,
-    /// Number of splats that were selected; all if the edit is of the whole scene.
+    /// Number of selected splats; all of them if the edit applies to the whole scene.
     pub selected: usize,
-    /// How the whole scene was moved, in the dataset's coordinates, if it was: for what else stands in it. The draft's cameras have followed.
+    /// The transform of the whole scene, in the dataset's coordinates, if it was moved: for other objects in it. The draft's cameras have
+    /// been moved already.
     pub moved: Option<Transform>,
     /// The scene that was split off, with its name.
     pub split: Option<(String, GaussianCloud)>,
 }
 
-/// Makes an edit. If it fails, nothing has changed.
+/// Applies an edit. If it fails, nothing changes.
 ///
 /// # Errors
 /// When the edit is invalid or not possible on this scene.
@@ -86,7 +87,7 @@ pub fn apply(draft: &mut Draft, edit: &Edit, open: Open) -> Result<Applied, Edit
     Ok(Plan::new(draft, edit, open)?.carry_out(draft))
 }
 
-/// An edit of which nothing can fail any more.
+/// An edit that can no longer fail.
 pub(crate) struct Plan {
     edit: Edit,
     selection: Selection,
@@ -96,7 +97,7 @@ pub(crate) struct Plan {
 /// What happens to the splats.
 pub(crate) enum Change {
     Remove(Selection),
-    /// Removes the splats, and gives them to a new scene of this name.
+    /// Moves the splats to a new scene of this name.
     Split(Selection, String),
     Transform(Selection, Transform),
     TransformScene(Transform),
@@ -110,7 +111,7 @@ pub(crate) enum Change {
 }
 
 impl Change {
-    /// Whether what is left of the scene does not look as in its photographs.
+    /// Whether the scene no longer matches its photographs after the change.
     fn leaves_photographs_behind(&self) -> bool {
         matches!(
             self,
@@ -128,7 +129,7 @@ impl Plan {
             (Operation::Show {}, steps) => among(draft, &draft.hidden, steps.as_deref())?,
             (Operation::Unlock {}, steps) => among(draft, &draft.locked, steps.as_deref())?,
             (_, Some(steps)) => select(draft, steps)?,
-            // What moves with the whole scene.
+            // Hidden and locked splats move with the whole scene.
             (
                 Operation::Move { .. }
                 | Operation::Rotate { .. }
@@ -230,7 +231,7 @@ impl Plan {
             Operation::Opacity { factor } if *factor == 1.0 => Change::Nothing,
             Operation::Opacity { factor } => Change::Fade(selection, *factor),
             Operation::Reduce { count } => {
-                // Of the whole scene, what is locked counts and stays.
+                // In the whole scene, locked splats stay and count.
                 let stay = if is_scene { locked_in_sight(draft) } else { 0 };
                 Change::Remove(least_important(draft, selection, count.saturating_sub(stay)))
             }
@@ -320,7 +321,7 @@ impl Plan {
     }
 }
 
-/// What `steps` select among `marked`; all of them if there are no steps.
+/// The splats that `steps` select among `marked`; all of those if there are no steps.
 fn among(draft: &Draft, marked: &Selection, steps: Option<&[crate::SelectStep]>) -> Result<Selection, EditError> {
     steps.map_or_else(|| Ok(marked.clone()), |steps| select_among(draft, steps, marked))
 }
@@ -342,7 +343,7 @@ fn remove(draft: &mut Draft, selection: Selection) -> Provenance {
     draft.cloud = gather(&draft.cloud, &kept);
     draft.hidden = draft.hidden.gather(&kept);
     draft.locked = draft.locked.gather(&kept);
-    draft.last = Selection::none(kept.len());
+    draft.last = draft.last.gather(&kept);
     Provenance {
         changed: Selection::none(kept.len()),
         sources: Some(kept),
@@ -362,7 +363,7 @@ fn faded(opacity_logit: f32, factor: f64) -> f32 {
     logit(opacity.clamp(1e-6, 0.9999) as f32)
 }
 
-/// The turn of `up` to the axis, and the move of the ground to height 0.
+/// The transform that turns `up` to the axis and moves the ground to height 0.
 fn upright(up: [f64; 3], ground: Option<[f64; 3]>, axis: UpAxis) -> Transform {
     let to = match axis {
         UpAxis::PlusY => DVec3::Y,
@@ -382,7 +383,7 @@ fn upright(up: [f64; 3], ground: Option<[f64; 3]>, axis: UpAxis) -> Transform {
     }
 }
 
-/// Of the selected splats those that matter least, all but `count`.
+/// The least important of the selected splats: all but `count`.
 fn least_important(draft: &Draft, selection: Selection, count: usize) -> Selection {
     let cloud = &draft.cloud;
     let importance = |i: &u32| {

@@ -1,21 +1,21 @@
 use rayon::prelude::*;
 
-/// Which splats of a scene are meant: one truth value each.
+/// A set of splats of a scene: one flag per splat.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Selection(Vec<bool>);
 
 impl Selection {
-    /// None of `n`.
+    /// Selects none of `n` splats.
     pub fn none(n: usize) -> Self {
         Self(vec![false; n])
     }
 
-    /// All of `n`.
+    /// Selects all of `n` splats.
     pub fn all(n: usize) -> Self {
         Self(vec![true; n])
     }
 
-    /// Those of `n` for which `is_in` holds.
+    /// Selects those of `n` splats for which `is_in` is true.
     pub fn of(n: usize, is_in: impl Fn(usize) -> bool + Sync + Send) -> Self {
         Self((0..n).into_par_iter().with_min_len(1024).map(is_in).collect())
     }
@@ -40,7 +40,7 @@ impl Selection {
         self.0[i]
     }
 
-    /// One truth value per splat.
+    /// One flag per splat.
     pub fn as_slice(&self) -> &[bool] {
         &self.0
     }
@@ -50,27 +50,27 @@ impl Selection {
         (0..self.len() as u32).filter(|i| self.0[*i as usize]).collect()
     }
 
-    /// Selects splat `i`, or not.
+    /// Selects or deselects splat `i`.
     pub fn set(&mut self, i: usize, selected: bool) {
         self.0[i] = selected;
     }
 
-    /// Selects what is in `other`, too.
+    /// Adds the splats of `other`.
     pub fn add(&mut self, other: &Self) {
         self.combine(other, |a, b| a | b);
     }
 
-    /// Selects what is in `other` no more.
+    /// Removes the splats of `other`.
     pub fn subtract(&mut self, other: &Self) {
         self.combine(other, |a, b| a & !b);
     }
 
-    /// Selects only what is in both.
+    /// Keeps only the splats that are also in `other`.
     pub fn intersect(&mut self, other: &Self) {
         self.combine(other, |a, b| a & b);
     }
 
-    /// Selects what was not selected.
+    /// Selects exactly the splats that were not selected.
     pub fn invert(&mut self) {
         self.0.iter_mut().for_each(|selected| *selected = !*selected);
     }
@@ -87,7 +87,7 @@ impl Selection {
         self.0.resize(self.len() + n, false);
     }
 
-    /// The truth values of the splats `indices`, in that order.
+    /// The flags of the splats `indices`, in that order.
     pub(crate) fn gather(&self, indices: &[u32]) -> Self {
         Self(indices.iter().map(|i| self.0[*i as usize]).collect())
     }

@@ -5,12 +5,12 @@ use glam::{DQuat, DVec2, DVec3, Vec3};
 use irradia_scene::{Camera, Intrinsics, Pose, Similarity};
 use serde::{Deserialize, Serialize};
 
-/// Most points of a polygon or a stroke.
+/// Maximum number of points of a polygon or a stroke.
 const MOST_POINTS: usize = 10_000;
 /// Largest coordinate or length.
 const FARTHEST: f64 = 1e12;
 
-/// One step of a selection: a shape, and what it does to what is selected so far.
+/// One step of a selection: a shape, and how it changes the current selection.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SelectStep {
     /// How the shape is combined; add if absent.
@@ -21,16 +21,16 @@ pub struct SelectStep {
     pub shape: Shape,
 }
 
-/// How a step is combined with what is selected so far. A selection whose first step subtracts or intersects starts with all splats.
+/// How a step is combined with the current selection. A selection whose first step subtracts or intersects starts with all splats.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Mode {
-    /// Selects what is in the shape, too.
+    /// Adds the splats in the shape.
     #[default]
     Add,
-    /// Selects it no more.
+    /// Removes the splats in the shape.
     Subtract,
-    /// Selects only what is in both.
+    /// Keeps only the splats in the shape.
     Intersect,
 }
 
@@ -65,24 +65,24 @@ pub enum Shape {
     },
     /// Everything on one side of a plane.
     HalfSpace {
-        /// A point of the plane.
+        /// A point on the plane.
         point: [f64; 3],
-        /// Points to the side that is selected.
+        /// Normal of the plane, pointing to the side that is selected.
         normal: [f64; 3],
     },
-    /// What is inside a polygon or lasso in a picture, at any depth.
+    /// The splats inside a polygon or lasso drawn over a picture, at any depth.
     Polygon {
-        /// Where the picture was taken.
+        /// The camera of the picture.
         camera: Viewpoint,
-        /// Corners, pixels of the picture; the last is joined to the first. Inside is even-odd.
+        /// Corners, pixels of the picture; the last is joined to the first. The inside follows the even-odd rule.
         points: Vec<[f64; 2]>,
         /// Only splats that the picture shows, not those behind others.
         #[serde(default, skip_serializing_if = "is_false")]
         visible: bool,
     },
-    /// What a brush touched in a picture.
+    /// The splats that a brush touched in a picture.
     Brush {
-        /// Where the picture was taken.
+        /// The camera of the picture.
         camera: Viewpoint,
         /// The stroke, pixels of the picture; a single point is a dab.
         points: Vec<[f64; 2]>,
@@ -126,7 +126,7 @@ pub enum Shape {
         #[serde(default, skip_serializing_if = "Option::is_none")]
         max: Option<f64>,
     },
-    /// A range of numbers of training views that show the splat.
+    /// A range of the number of training views that show the splat.
     Views {
         /// Lowest.
         #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -135,43 +135,43 @@ pub enum Shape {
         #[serde(default, skip_serializing_if = "Option::is_none")]
         max: Option<u32>,
     },
-    /// Connected groups of splats by their number. Splats are connected where the cubes of side `gap` in which they lie touch.
+    /// Connected groups of splats, by the number of splats. Two splats are connected if the cubes of side `gap` that contain them touch.
     Clusters {
-        /// Fewest splats of the group.
+        /// Minimum number of splats in the group.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         min: Option<usize>,
-        /// Most splats of the group.
+        /// Maximum number of splats in the group.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         max: Option<usize>,
-        /// Side of the cubes; 4 times the median distance of neighbours if absent.
+        /// Side of the cubes; if absent, 4 times the median distance to the nearest neighbour.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         gap: Option<f64>,
     },
     /// Floaters, by their score.
     Floaters {
-        /// Lowest score, more than 0; 1 if absent. Less finds more.
+        /// Lowest score, above 0; 1 if absent. Lower values find more.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         score: Option<f64>,
     },
-    /// The subject of the cameras: what surrounds the point at which they look.
+    /// The subject of the cameras: what surrounds the point that they look at.
     Subject {
         /// Factor on its radius; 1 if absent.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         margin: Option<f64>,
     },
-    /// What the edit before was made of; of a duplicate the copies, of what was removed nothing. It lets a selection that was moved be
-    /// turned as well.
+    /// The splats that the previous edit was applied to: those it added after a duplicate or merge, none after a removal. It allows a
+    /// selection that was moved to be rotated as well.
     Last {},
-    /// What is not selected so far. Always of mode add.
+    /// Everything that is not in the current selection. Its mode is always add.
     Invert {},
-    /// What is selected so far, and all splats closer to it than a distance. Always of mode add.
+    /// The current selection, and all splats within a distance of it. Its mode is always add.
     Grow {
         /// The distance.
         by: f64,
     },
-    /// What is selected so far, and everything connected to it as in [`Shape::Clusters`]. Always of mode add.
+    /// The current selection, and everything connected to it as in [`Shape::Clusters`]. Its mode is always add.
     Connected {
-        /// Side of the cubes; 4 times the median distance of neighbours if absent.
+        /// Side of the cubes; if absent, 4 times the median distance to the nearest neighbour.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         gap: Option<f64>,
     },
@@ -206,7 +206,7 @@ pub struct Viewpoint {
 }
 
 impl Viewpoint {
-    /// Of a camera in the world of `world_from_dataset`.
+    /// The viewpoint of a camera in the world of `world_from_dataset`.
     pub fn of(camera: &Camera, world_from_dataset: &Similarity) -> Self {
         let (k, q) = (&camera.intrinsics, camera.pose.rotation);
         Self {
@@ -265,7 +265,7 @@ impl SelectStep {
         Self { mode: Mode::Add, shape }
     }
 
-    /// Whether every number is in range.
+    /// Checks that every number is in range.
     ///
     /// # Errors
     /// [`EditError::Value`] for the first that is not.
@@ -276,7 +276,7 @@ impl SelectStep {
         );
         if changes_selection && self.mode != Mode::Add {
             return Err(EditError::Selection(
-                "invert, grow and connected change what is selected so far: they have no mode".into(),
+                "invert, grow and connected change the current selection and take no mode".into(),
             ));
         }
         match &self.shape {
@@ -331,7 +331,7 @@ impl SelectStep {
     }
 }
 
-/// Checks that all are numbers of a sensible magnitude.
+/// Checks that all values are numbers of a sensible magnitude.
 pub(crate) fn finite(name: &str, values: &[f64]) -> Result<(), EditError> {
     match values.iter().all(|v| v.abs() <= FARTHEST) {
         true => Ok(()),
@@ -339,7 +339,7 @@ pub(crate) fn finite(name: &str, values: &[f64]) -> Result<(), EditError> {
     }
 }
 
-/// Checks that it is a positive number of a sensible magnitude.
+/// Checks that a value is a positive number of a sensible magnitude.
 pub(crate) fn positive(name: &str, value: f64) -> Result<(), EditError> {
     match value > 1e-12 && value <= FARTHEST {
         true => Ok(()),
@@ -347,7 +347,7 @@ pub(crate) fn positive(name: &str, value: f64) -> Result<(), EditError> {
     }
 }
 
-/// Checks that it has a direction.
+/// Checks that a vector has a direction.
 pub(crate) fn direction(name: &str, vector: &[f64; 3]) -> Result<(), EditError> {
     finite(name, vector)?;
     match DVec3::from(*vector).length() > 1e-9 {
@@ -373,7 +373,7 @@ fn points_are(name: &str, points: &[[f64; 2]], least: usize) -> Result<(), EditE
 }
 
 fn range<T: PartialOrd>(name: &str, min: Option<&T>, max: Option<&T>) -> Result<(), EditError> {
-    // A bound that is no number equals not even itself.
+    // NaN does not compare even to itself.
     let is_number = |bound: Option<&T>| bound.is_none_or(|bound| bound.partial_cmp(bound).is_some());
     if !is_number(min) || !is_number(max) {
         return Err(EditError::value(name, "min and max must be numbers"));

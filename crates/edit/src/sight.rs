@@ -7,19 +7,19 @@ use irradia_scene::Camera;
 use irradia_splat::{Gather, OutputGradient, RenderOptions, Renderer, SplatGradients, Splats, ViewParams};
 use rayon::prelude::*;
 
-/// Longest side of the pictures, pixels.
+/// Length of the longer side of the pictures, pixels.
 const SIDE: f32 = 480.0;
-/// From how many pixels on a splat counts as seen; its blending weights count, so that a hidden splat has none.
+/// Minimum sum of its blending weights, in pixels, for a splat to count as seen. The sum is 0 for a splat hidden behind others.
 pub(crate) const SEEN: f32 = 0.25;
-/// Pixels of less alpha have no depth.
+/// Pixels with a lower alpha have no depth.
 const COVERED: f32 = 0.5;
 
 /// Renders small pictures of some splats.
 pub(crate) struct Observer {
     splats: Splats,
-    /// The draft's number of each splat.
+    /// Index of each splat in the draft.
     numbers: Vec<u32>,
-    /// Splats of the draft.
+    /// Number of splats of the draft.
     count: usize,
     options: RenderOptions,
     renderer: Renderer,
@@ -30,7 +30,7 @@ pub(crate) struct Observer {
 /// Mean depth along +Z in each pixel of a picture.
 pub(crate) struct Depths {
     camera: Camera,
-    /// `[H, W]`, world units; infinite where nothing is.
+    /// `[H, W]`, world units; infinite where alpha is below [`COVERED`].
     depth: Vec<f32>,
 }
 
@@ -49,7 +49,7 @@ impl Depths {
 }
 
 impl Observer {
-    /// Of the splats `of`.
+    /// An observer of the splats `of`.
     pub fn new(draft: &Draft, of: &Selection) -> Self {
         let numbers = of.indices();
         Self {

@@ -6,8 +6,8 @@ use glam::Vec3;
 use irradia_scene::Camera;
 use irradia_splat::init::focus_point;
 
-/// The point at which the cameras look, and a radius around it that fills their pictures: the median of the radii of the balls there that
-/// touch the farther borders. In the coordinates of the dataset; `None` without cameras.
+/// The point that the cameras look at, and a radius around it that fills their images: the median over the cameras of the radius of the
+/// ball there that spans the longer side of the image. In the coordinates of the dataset; `None` without cameras.
 pub fn subject(draft: &Draft) -> Option<([f64; 3], f64)> {
     if draft.cameras.is_empty() {
         return None;
@@ -22,7 +22,7 @@ pub fn subject(draft: &Draft) -> Option<([f64; 3], f64)> {
     ))
 }
 
-/// Radius of the ball around `focus` that spans the longer side of the camera's picture, if the camera looked at it.
+/// Radius of the ball around `focus` that would span the longer side of the camera's image if the camera looked at it.
 fn framed_radius(camera: &Camera, focus: Vec3) -> f32 {
     let k = &camera.intrinsics;
     let tangent = (0.5 * k.width as f32 / k.fx).max(0.5 * k.height as f32 / k.fy);

@@ -1,19 +1,20 @@
-//! Edits in one line, for command lines and lists of what was done:
+//! Edits as one line of text, for command lines and histories:
 //!
 //! ```text
 //! OPERATION [KEY=VALUE ..] [[+|-|&]SHAPE [KEY=VALUE ..]] ..
 //! ```
 //!
-//! `+` adds a shape to the selection (as no sign does), `-` subtracts it, `&` intersects. Values are numbers, words, vectors
-//! (`1,2,3`) and lists of vectors (`0,0;1,0;1,1`, a single one as `0,0;`); `camera.size=640,480` is a key of a table. What is in quotes, `"my scene.ply"`, is
-//! one word and no number. The words stand for the same keys as in TOML, so that a new operation or shape needs nothing here.
+//! `+` adds a shape to the selection (the default without a sign), `-` subtracts it, `&` intersects. Values are numbers, words, vectors
+//! (`1,2,3`) and lists of vectors (`0,0;1,0;1,1`, a single one as `0,0;`); `camera.size=640,480` is a key of a table. Text in quotes,
+//! such as `"my scene.ply"`, is one word and never a number. Keys are the same as in TOML, so that a new operation or shape needs no
+//! change here.
 
 use crate::{Edit, EditError};
 use std::fmt;
 use std::str::FromStr;
 use toml::{Table, Value};
 
-/// What keeps spaces within a word.
+/// Keeps spaces within a word.
 const QUOTE: char = '"';
 
 impl FromStr for Edit {
@@ -59,7 +60,7 @@ impl FromStr for Edit {
     }
 }
 
-/// The words of `text`, with their quotes.
+/// Splits `text` into words, which keep their quotes.
 fn words(text: &str) -> Result<Vec<String>, EditError> {
     let (mut words, mut word, mut quoted) = (Vec::new(), String::new(), false);
     for c in text.chars() {
@@ -77,7 +78,7 @@ fn words(text: &str) -> Result<Vec<String>, EditError> {
     Ok(words)
 }
 
-/// Puts `value` under `key`, whose dots open tables.
+/// Inserts `value` under `key`; a dot in the key opens a table.
 fn insert(table: &mut Table, key: &str, value: Value) -> Result<(), &'static str> {
     let reserved = ["op", "select", "mode", "shape"];
     if key.is_empty() || reserved.contains(&key) {
@@ -93,7 +94,7 @@ fn insert(table: &mut Table, key: &str, value: Value) -> Result<(), &'static str
     insert(entry.as_table_mut().ok_or("given twice")?, inner, value)
 }
 
-/// A number, a vector, a list of vectors, a truth value, otherwise a word, as anything in quotes.
+/// Parses a number, a vector, a list of vectors or a Boolean; anything else, and anything in quotes, is a word.
 fn value(text: &str) -> Value {
     if text.contains(QUOTE) {
         return text.replace(QUOTE, "").into();

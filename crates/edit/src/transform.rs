@@ -42,7 +42,7 @@ impl Transform {
         }
     }
 
-    /// A point after the transform.
+    /// Transforms a point.
     pub fn apply(&self, point: DVec3) -> DVec3 {
         self.scale * (self.rotation * point) + self.translation
     }
@@ -56,7 +56,7 @@ impl Transform {
         }
     }
 
-    /// The transform back.
+    /// The inverse transform.
     pub fn inverse(&self) -> Self {
         let (scale, rotation) = (1.0 / self.scale, self.rotation.inverse());
         Self {
@@ -72,7 +72,7 @@ impl Transform {
     }
 }
 
-/// Transforms the splats `indices`.
+/// Transforms the selected splats.
 pub(crate) fn transform_splats(cloud: &mut GaussianCloud, selection: &Selection, transform: &Transform) {
     let world = cloud.world_from_dataset;
     let moved = |mean: [f32; 3]| {
@@ -85,7 +85,7 @@ pub(crate) fn transform_splats(cloud: &mut GaussianCloud, selection: &Selection,
     turn_and_scale(cloud, Some(selected), transform);
 }
 
-/// Rotates quaternions and harmonics, and scales sizes; of all splats if `selected` is `None`.
+/// Rotates the quaternions and harmonics of the selected splats and scales their sizes; those of all splats if `selected` is `None`.
 fn turn_and_scale(cloud: &mut GaussianCloud, selected: Option<&[bool]>, transform: &Transform) {
     let is_in = |i: usize| selected.is_none_or(|selected| selected[i]);
     if transform.scale != 1.0 {
@@ -115,8 +115,8 @@ fn turn_and_scale(cloud: &mut GaussianCloud, selected: Option<&[bool]>, transfor
 
 /// Transforms everything: splats and cameras.
 ///
-/// Translation and scale go into the world rather than into its coordinates, which keeps every digit and an ordinary size of the
-/// world, unless the world was the dataset's and may remain so.
+/// Translation and scale change `world_from_dataset` rather than the coordinates, which keeps every digit and a world of ordinary size,
+/// unless the world's coordinates were those of the dataset and can stay so.
 pub(crate) fn transform_scene(draft: &mut Draft, transform: &Transform) {
     let old = draft.cloud.world_from_dataset;
     // world = s (d - c) and d' = k R d + t: with s' = s / k and c' = k R c + t, world' = s' (d' - c') = R world.
@@ -149,7 +149,7 @@ pub(crate) fn transform_scene(draft: &mut Draft, transform: &Transform) {
     }
 }
 
-/// Whether the dataset's own coordinates serve as world: of ordinary size, and not far from the origin.
+/// Whether the dataset's own coordinates can serve as the world: the scene has an ordinary size and is not far from the origin.
 fn is_ordinary(cloud: &GaussianCloud) -> bool {
     let world = cloud.world_from_dataset;
     let n = cloud.len().max(1);

@@ -13,21 +13,21 @@ use serde::{Deserialize, Serialize};
 pub enum Sampler {
     /// Steps through the occupied cells of a grid (Instant-NGP).
     Occupancy(Occupancy),
-    /// NeRF: a coarse network over even intervals, and a fine one over these and more, drawn from the coarse weights.
+    /// NeRF: a coarse network over even intervals, and a fine one over these plus intervals drawn from the coarse weights.
     Hierarchy {
-        /// Even intervals: 64.
+        /// Number of even intervals: 64.
         coarse: usize,
-        /// Additional intervals for the fine network: 128.
+        /// Number of additional intervals for the fine network: 128.
         fine: usize,
     },
     /// mip-NeRF 360: small proposal networks place the samples of the last one.
     Proposal {
         /// Each proposal network with its number of intervals.
         rounds: Vec<(NetShape, usize)>,
-        /// Intervals of the last network.
+        /// Number of intervals of the last network.
         last: usize,
     },
-    /// No ray sampling: points are given, such as splats to whose colour the field adds ([`crate::residual_at`]).
+    /// No ray sampling: the field adds to the colours of given points, such as splats ([`crate::residual_at`]).
     Given {
         /// Directions are view directions reflected at the point's surface, instead of view directions.
         mirrored: bool,
@@ -63,7 +63,7 @@ pub struct FieldConfig {
     pub background_degree: Option<u32>,
 }
 
-/// Most samples per ray and round.
+/// Maximum number of samples per ray and round.
 const MOST_SAMPLES: usize = 1 << 16;
 
 impl FieldConfig {
@@ -144,7 +144,7 @@ impl FieldConfig {
         self.net.color.map_or(0, |color| color.appearance)
     }
 
-    /// The shapes of all networks, the last one last.
+    /// The shapes of all networks, in order of evaluation.
     pub fn nets(&self) -> Vec<NetShape> {
         match &self.sampler {
             Sampler::Occupancy(_) | Sampler::Given { .. } => vec![self.net],
@@ -166,11 +166,11 @@ impl FieldConfig {
     /// Checks that all sizes are within bounds.
     ///
     /// # Errors
-    /// The first size that is not.
+    /// The first size that is out of bounds.
     pub fn check(&self) -> Result<(), FieldError> {
         let wrong = |what, value: String, hint| Err(FieldError::Config { what, value, hint });
         if let Some(degree) = self.background_degree.filter(|degree| *degree > MAX_DEGREE) {
-            return wrong("degree of the background", degree.to_string(), "must be  0 to 3");
+            return wrong("degree of the background", degree.to_string(), "must be 0 to 3");
         }
         // A file beyond these limits is broken, and sums of its sizes could overflow.
         let limits = |net: &NetShape| {
@@ -184,17 +184,17 @@ impl FieldConfig {
             };
             let color = net.color.map_or([0; 3], |c| [c.width, c.depth, c.appearance]);
             [
-                ("width of a hidden layer", net.width, 4096, "must be  at most 4096"),
-                ("number of hidden layers", net.depth, 64, "must be  at most 64"),
-                ("geometry", net.geometry, 4096, "must be  at most 4096"),
-                ("octaves", octaves.max(toward), 32, "must be  at most 32"),
-                ("width of a colour layer", color[0], 4096, "must be  at most 4096"),
-                ("number of colour layers", color[1], 64, "must be  at most 64"),
-                ("appearance code", color[2], 4096, "must be  at most 4096"),
+                ("width of a hidden layer", net.width, 4096, "must be at most 4096"),
+                ("number of hidden layers", net.depth, 64, "must be at most 64"),
+                ("geometry", net.geometry, 4096, "must be at most 4096"),
+                ("octaves", octaves.max(toward), 32, "must be at most 32"),
+                ("width of a colour layer", color[0], 4096, "must be at most 4096"),
+                ("number of colour layers", color[1], 64, "must be at most 64"),
+                ("appearance code", color[2], 4096, "must be at most 4096"),
             ]
         };
         if self.images > 1 << 24 {
-            return wrong("number of images", self.images.to_string(), "must be  at most 2^24");
+            return wrong("number of images", self.images.to_string(), "must be at most 2^24");
         }
         for net in self.nets() {
             for (what, value, most, hint) in limits(&net) {
@@ -204,13 +204,13 @@ impl FieldConfig {
             }
             if let PositionEncoding::HashGrid(g) = &net.encoding {
                 if ![1, 2, 4, 8].contains(&g.features) {
-                    return wrong("features of a level", g.features.to_string(), "must be  1, 2, 4 or 8");
+                    return wrong("features of a level", g.features.to_string(), "must be 1, 2, 4 or 8");
                 }
                 if !(1..=32).contains(&g.levels) {
-                    return wrong("levels", g.levels.to_string(), "must be  1 to 32");
+                    return wrong("levels", g.levels.to_string(), "must be 1 to 32");
                 }
                 if !(4..=24).contains(&g.log2_table) {
-                    return wrong("log2 of a table", g.log2_table.to_string(), "must be  4 to 24");
+                    return wrong("log2 of a table", g.log2_table.to_string(), "must be 4 to 24");
                 }
                 if g.coarsest < 1 || g.finest < g.coarsest || g.finest > 1 << 20 {
                     let range = format!("{}..{}", g.coarsest, g.finest);
@@ -221,7 +221,7 @@ impl FieldConfig {
                 return wrong(
                     "width of a hidden layer",
                     net.width.to_string(),
-                    "must be  a multiple of 8",
+                    "must be a multiple of 8",
                 );
             }
             if let Some(color) = net.color {
@@ -229,7 +229,7 @@ impl FieldConfig {
                     return wrong(
                         "width of a colour layer",
                         color.width.to_string(),
-                        "must be  a multiple of 8",
+                        "must be a multiple of 8",
                     );
                 }
                 if color.appearance != self.appearance() {
@@ -251,7 +251,7 @@ impl FieldConfig {
         match &self.sampler {
             Sampler::Occupancy(o) => {
                 if !(4..=512).contains(&o.side) {
-                    return wrong("side of the occupancy grid", o.side.to_string(), "must be  4 to 512");
+                    return wrong("side of the occupancy grid", o.side.to_string(), "must be 4 to 512");
                 }
                 if !(o.steps.shortest > 1e-5 && o.steps.cone >= 0.0 && o.steps.cone < 1.0) {
                     return wrong(
@@ -264,7 +264,7 @@ impl FieldConfig {
             Sampler::Hierarchy { coarse, fine } => {
                 if !(2..=MOST_SAMPLES).contains(coarse) || !(1..=MOST_SAMPLES).contains(fine) {
                     let value = format!("{coarse} + {fine}");
-                    return wrong("samples", value, "must be  at least 2 and 1, and at most 65536");
+                    return wrong("samples", value, "must be at least 2 and 1, and at most 65536");
                 }
             }
             Sampler::Proposal { rounds, last } => {

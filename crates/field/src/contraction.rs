@@ -29,7 +29,7 @@ pub fn contract<T: Scalar>(x: [T; 3]) -> [T; 3] {
     [x[0] * scale, x[1] * scale, x[2] * scale]
 }
 
-/// The point whose contraction is `y`, whose coordinates are below 2.
+/// The point whose contraction is `y`; the coordinates of `y` are below 2 in magnitude.
 #[inline(always)]
 pub fn uncontract<T: Scalar>(y: [T; 3]) -> [T; 3] {
     let (one, two) = (T::from_f64(1.0), T::from_f64(2.0));

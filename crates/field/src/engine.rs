@@ -9,7 +9,7 @@ use {crate::gpu::GpuFieldTraining, std::sync::OnceLock};
 
 /// The state of a field in training, on the CPU or on a GPU: the counterpart of splats' `Engine`.
 pub struct FieldEngine {
-    /// With a GPU, its parameters and moments are those of the beginning; everything else is up to date.
+    /// On a GPU, its parameters and moments stay at their initial values; everything else is up to date.
     state: FieldState,
     #[cfg(feature = "gpu")]
     gpu: Option<OnGpu>,
@@ -18,12 +18,12 @@ pub struct FieldEngine {
 #[cfg(feature = "gpu")]
 struct OnGpu {
     training: Box<GpuFieldTraining>,
-    /// The whole state, once read back after the last step.
+    /// The whole state, if it has been read back since the last step.
     read: OnceLock<FieldState>,
 }
 
 impl FieldEngine {
-    /// Continues with `state`: on a GPU if `device` is one and the field has a form there.
+    /// Continues with `state`: on a GPU if `device` is one and GPUs support the field.
     ///
     /// # Errors
     /// When the device refuses the kernels.
@@ -42,10 +42,10 @@ impl FieldEngine {
         })
     }
 
-    /// What has gone wrong on the device: the state is then unspecified.
+    /// Checks for failures of the device, after which the state is unspecified.
     ///
     /// # Errors
-    /// When something has.
+    /// The failure, if there was one.
     pub fn check_device(&self) -> Result<(), DeviceError> {
         #[cfg(feature = "gpu")]
         if let Some(on) = &self.gpu {
@@ -73,7 +73,7 @@ impl FieldEngine {
         &self.state
     }
 
-    /// As [`crate::train_views`].
+    /// Like [`crate::train_views`].
     pub fn train_views(&mut self, views: &[TrainView], options: &StepOptions) -> StepLoss {
         #[cfg(feature = "gpu")]
         if let Some(on) = &mut self.gpu {

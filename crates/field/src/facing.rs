@@ -9,7 +9,7 @@ use irradia_scene::Camera;
 /// stay below 20; a capture that goes around its object by a quarter of a circle has 45.
 pub const FORWARD_CONE: f32 = 30.0;
 
-/// How the cameras of a capture face.
+/// Orientation of the cameras of a capture.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Facing {
     /// Largest angle between a camera's axis and the mean axis, degrees.
@@ -19,7 +19,7 @@ pub struct Facing {
 }
 
 impl Facing {
-    /// How `cameras` face; `None` without cameras or if their axes cancel out.
+    /// The orientation of `cameras`; `None` without cameras or if their axes cancel out.
     pub fn of(cameras: &[Camera]) -> Option<Self> {
         let axis = |camera: &Camera| camera.pose.rotation * Vec3::Z;
         let mean = cameras.iter().map(axis).sum::<Vec3>().try_normalize()?;

@@ -29,9 +29,9 @@ pub enum FieldError {
     Tensor {
         /// Its name.
         name: String,
-        /// Values found, 0 where it is missing.
+        /// Number of values found, 0 if the tensor is missing.
         found: usize,
-        /// Values expected.
+        /// Number of values expected.
         expected: usize,
     },
 }
@@ -43,13 +43,13 @@ pub struct Field {
     pub config: FieldConfig,
     /// The space it is defined in.
     pub space: Space,
-    /// Its networks, the last one last.
+    /// Its networks, in order of evaluation.
     pub nets: Vec<Net>,
     /// Their parameters.
     pub parameters: Vec<NetParameters<f32>>,
     /// Appearance codes `[images, appearance]`.
     pub codes: Vec<f32>,
-    /// The background's harmonics `[(degree + 1)^2, 3]`, empty where none is learnt: see [`crate::background_color`].
+    /// The background's harmonics `[(degree + 1)^2, 3]`, empty if none is learnt: see [`crate::background_color`].
     pub background: Vec<f32>,
     /// The occupancy grid of [`Sampler::Occupancy`].
     pub occupancy: Option<OccupancyGrid>,
@@ -85,8 +85,8 @@ impl Field {
         })
     }
 
-    /// A field for [`crate::residual_at`], initialised to add nothing to any colour; with random codes for `images` photographs, if its
-    /// network takes codes: of equal ones none would ever differ.
+    /// A field for [`crate::residual_at`], initialised to add nothing to any colour. If its network takes codes, those of the `images`
+    /// photographs are random, because codes that start equal would stay equal.
     ///
     /// # Errors
     /// When the configuration of its network is invalid.
@@ -109,7 +109,7 @@ impl Field {
         self.len() == 0
     }
 
-    /// Names, shapes and values of all tensors: with configuration and space, enough to restore the field.
+    /// Names, shapes and values of all tensors: together with configuration and space, enough to restore the field.
     pub fn tensors(&self) -> Tensors<'_> {
         let mut list = named("", &self.parameters, [&self.codes, &self.background]);
         if let Some(grid) = &self.occupancy {

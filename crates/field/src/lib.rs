@@ -3,8 +3,8 @@
 //!
 //! To train: [`Space::around`] or [`Space::ndc`] from the cameras, [`Field::new`], [`FieldState::new`], then [`train_views`]
 //! once per step. [`render_view`] renders, [`to_points`] extracts surfaces, and [`FieldState::tensors`] with the step and the
-//! number of rays forms a checkpoint from which training resumes bit for bit. [`FieldEngine`] does so on a GPU where the field has a
-//! form there.
+//! number of rays forms a checkpoint from which training resumes bit for bit. [`FieldEngine`] trains on a GPU if it supports the
+//! field.
 #![forbid(unsafe_code)]
 
 mod background;

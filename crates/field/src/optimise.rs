@@ -11,7 +11,7 @@ pub(crate) struct Adam<'a> {
     pub second: &'a mut [f32],
     pub rate: f32,
     pub step: AdamStep,
-    /// Parameters whose gradient is zero keep value and moments, such as table entries that no sample touched.
+    /// Parameters whose gradient is zero, such as table entries that no sample touched, keep their value and moments.
     pub sparse: bool,
 }
 
@@ -28,7 +28,7 @@ impl Kernel for Adam<'_> {
         let n = self.parameters.len();
         let mut at = 0;
         while at < n {
-            // A last vector that is not whole goes through a copy.
+            // A partial last vector goes through a copy.
             let mut copies = [[0.0f32; 16]; 4];
             let whole = at + S::LANES <= n;
             let count = if whole { S::LANES } else { n - at };

@@ -18,9 +18,9 @@ use irradia_compute::Level;
 use irradia_compute::simd::{Kernel, Lanes, Simd};
 use irradia_scene::Rng;
 
-/// Samples that fill a chunk: 16 panels, whose activations fit the L2 cache.
+/// Number of samples that fills a chunk: 16 panels, whose activations fit the L2 cache.
 const CHUNK: usize = 512;
-/// Rays marched together through an occupancy grid: at the start of a chunk, and at most.
+/// Number of rays marched together through an occupancy grid: at the start of a chunk, and at most.
 const TOGETHER: [usize; 2] = [4, 16];
 
 /// One network's samples along a chunk of rays.
@@ -83,7 +83,7 @@ impl Pass {
         })
     }
 
-    /// Writes the derivative of each sample's density by its point in the unit cube to [`Self::slopes`].
+    /// Writes the derivative of each sample's density with respect to its point in the unit cube to [`Self::slopes`].
     pub fn slope(&mut self, level: Level, field: &Field, net: usize, transposed: &NetParameters<f32>) {
         level.run(Slopes {
             net: &field.nets[net],
@@ -208,7 +208,7 @@ pub(crate) fn trace(
                 steps: options.steps,
             };
             while taken < rays.len() && pass.middles.len() < CHUNK {
-                // As many as should fill the chunk, judging by the rays already in it.
+                // As many rays as should fill the chunk, judging by those already in it.
                 let missing = (CHUNK - pass.middles.len()) * taken / pass.middles.len().max(1);
                 let count = if taken == 0 {
                     TOGETHER[0]
@@ -280,8 +280,8 @@ pub(crate) fn trace(
     taken
 }
 
-/// The weights max-filtered over neighbours, then averaged, plus a small constant: samples then surround what was found and
-/// every interval keeps a chance (mip-NeRF, section 3.3).
+/// The weights max-filtered over neighbours, then averaged, plus a small constant: samples then surround the surfaces found so far,
+/// and every interval keeps a nonzero probability (mip-NeRF, section 3.3).
 fn blurred(weights: &[f32]) -> Vec<f32> {
     let n = weights.len();
     let at = |i: usize| weights[i.min(n - 1)];

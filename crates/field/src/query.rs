@@ -27,7 +27,7 @@ pub fn update_occupancy(state: &mut FieldState, all: bool, one_in: u32, seed: u6
     });
 }
 
-/// As [`update_occupancy`], with densities at points of the unit cube from `densities`.
+/// Like [`update_occupancy`], but `densities` evaluates the densities at points in the unit cube.
 pub(crate) fn update_occupancy_by(
     state: &mut FieldState,
     all: bool,

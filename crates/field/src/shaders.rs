@@ -1,4 +1,4 @@
-//! The kernels of a field, put together from their parts.
+//! The kernels of a field, assembled from their parts.
 
 use irradia_compute::shaders::{ADAM, GRID, HARMONICS};
 
@@ -13,11 +13,11 @@ const RATES: &str = include_str!("gpu/shaders/rates.wgsl");
 irradia_compute::kernels! {
     /// Twin: `walk::Walks::march`.
     march: [GRID, RAY, TASK, CORNERS],
-    /// Samples of all rays side by side, with `DirectionEncoding::encode`.
+    /// Stores the samples of all rays contiguously, with `DirectionEncoding::encode`.
     gather: [GRID, RAY, TASK, HARMONICS],
     /// Twin: `encoding::hash_grid::encode_level`.
     encode: [GRID, TASK, CORNERS, SAMPLE_LEVEL],
-    /// Twin: `Mlp::forward`, a layer.
+    /// Twin: one layer of `Mlp::forward`.
     dense: [GRID, LAYER],
     /// Twin: `Worker::backward`, up to the networks.
     composite: [GRID, RAY, TASK, HARMONICS, SAMPLE],
@@ -25,7 +25,7 @@ irradia_compute::kernels! {
     pixels: [GRID, RAY, TASK, HARMONICS, SAMPLE],
     /// Sums of the losses.
     totals: [TASK],
-    /// Twin: `Mlp::pull_back`, a layer.
+    /// Twin: one layer of `Mlp::pull_back`.
     dense_vjp: [GRID, LAYER],
     /// Twin: `mlp::outer`.
     weights_vjp: [GRID, LAYER],

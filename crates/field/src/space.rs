@@ -37,7 +37,7 @@ pub struct Frustum {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Space {
-    /// The world point that is 0 in field space.
+    /// The world point at the origin of field space.
     pub center: [f32; 3],
     /// Field units per world unit.
     pub scale: f32,

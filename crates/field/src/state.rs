@@ -41,7 +41,7 @@ impl FieldState {
         }
     }
 
-    /// The tensors of the field and of the moments: with [`Self::step`] and [`Self::rays`], a complete checkpoint, since random
+    /// The tensors of the field and of the moments: together with [`Self::step`] and [`Self::rays`] a complete checkpoint, since random
     /// numbers depend only on the seed and the step.
     pub fn tensors(&self) -> Tensors<'_> {
         let mut list = self.field.tensors();

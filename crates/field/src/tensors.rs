@@ -6,10 +6,10 @@ use crate::net::NetParameters;
 /// Name, shape and row-major values.
 pub type Tensors<'a> = Vec<(String, Vec<usize>, &'a [f32])>;
 
-/// Names of the parameters beside the networks'.
+/// Names of the parameter lists that are not part of a network.
 const LISTS: [&str; 2] = ["codes", "background"];
 
-/// `lists` are those of [`LISTS`].
+/// All tensors that are not empty, with `prefix` before their names; `lists` are in the order of [`LISTS`].
 pub(crate) fn named<'a>(prefix: &str, nets: &'a [NetParameters<f32>], lists: [&'a [f32]; 2]) -> Tensors<'a> {
     let mut list = Vec::new();
     for (i, net) in nets.iter().enumerate() {

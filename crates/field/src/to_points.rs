@@ -44,11 +44,11 @@ pub struct FieldPoints {
 
 /// Hits per point requested: a surface's cells are then hit more than once on average.
 const HITS_PER_POINT: usize = 2;
-/// Most rounds of as many rays: much of each image may be empty.
+/// Maximum number of rounds, each with as many rays as hits are needed: much of each image may be empty.
 const ROUNDS: u64 = 16;
 /// Rays per task.
 const CHUNK: usize = 1024;
-/// The finest thinning, cells per side of the unit cube.
+/// The finest grid for thinning, cells per side of the unit cube.
 const FINEST: u32 = 4096;
 
 /// Where one ray hit a surface.

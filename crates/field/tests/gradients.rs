@@ -1,4 +1,4 @@
-//! Every gradient against central differences in double precision, with the very code that trains: encodings and networks are
+//! Checks every gradient against central differences in double precision, using the code that trains: encodings and networks are
 //! generic over lanes, and here a lane is one `f64`.
 
 use irradia_compute::simd::Double;

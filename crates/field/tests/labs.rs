@@ -9,7 +9,7 @@ use irradia_field::sample::importance::{density, importance};
 use irradia_field::sample::stratified::stratified;
 use irradia_scene::Rng;
 
-/// Mean squared error of a small network after 400 steps on a signal of high frequency, 128 points of a line.
+/// Mean squared error of a small network after 400 steps on a high-frequency signal, at 128 points on a line.
 fn fit(encode: impl Fn(&[f64], &mut [f64]), inputs: usize) -> f64 {
     let mlp = Mlp::new(MlpShape {
         inputs,

@@ -1,4 +1,4 @@
-//! Networks on every instruction set against double precision, at sizes with partial tiles, strips and blocks.
+//! Compares networks on every instruction set with double precision, at sizes with partial tiles, strips and blocks.
 
 use irradia_compute::Level;
 use irradia_compute::simd::{Double, Kernel, Lanes, Scalar, Simd};

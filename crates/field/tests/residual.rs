@@ -84,7 +84,7 @@ fn a_residual_field_starts_at_zero_and_learns_view_dependence() {
         errors.push(error);
         train_residual(&mut state, &queries, &[(None, 1.0)], &v, &options);
     }
-    // A fall by a factor of about 100; a field without directions would keep two thirds of the error.
+    // The error falls by a factor of about 100; a field without directions would keep two thirds of it.
     assert!(errors[299] < 0.02 * errors[0], "{} to {}", errors[0], errors[299]);
     for (query, added) in queries.iter().zip(residual_at(&state.field, &queries, None)) {
         assert!(
@@ -165,6 +165,6 @@ fn codes_descend_along_their_gradient_each_for_its_photograph() {
     assert!((4..8).all(|i| before[i] != after[i]), "{before:?} {after:?}");
     assert!(
         (0..4).chain(8..12).all(|i| before[i] == after[i]),
-        "of other photographs"
+        "the codes of other photographs change"
     );
 }

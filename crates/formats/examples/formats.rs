@@ -1,7 +1,7 @@
 //! Speed and size of every splat format: `cargo run --release -p irradia-formats --example formats [COUNT] [DEGREE]`.
 //!
-//! Writes a scene made up in memory to a temporary folder, reads it back from the warm file system, and prints splats and bytes a
-//! second (the best of three), the size, and how much memory each took at most beyond the scene itself.
+//! Writes a synthetic scene to a temporary folder, reads it back from the warm file system, and prints splats and bytes per second (the
+//! best of three), the size, and the peak memory of each beyond the scene itself.
 
 use irradia_formats::{
     Quality, SplatFormat, SpzVersion, WriteOptions, read_splats, splat_file_size, write_splats_with,
@@ -49,7 +49,7 @@ fn scene(count: usize, sh_degree: u32) -> GaussianCloud {
     cloud
 }
 
-/// Peak resident memory of the process since the last reset, bytes; 0 where the system does not tell.
+/// Peak resident memory of the process since the last reset, bytes; 0 if the system does not report it.
 fn peak() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find(|line| line.starts_with("VmHWM"));
@@ -58,16 +58,16 @@ fn peak() -> u64 {
         * 1024
 }
 
-/// Processor seconds of all threads so far, in steps of 0.01; 0 where the system does not tell.
+/// Processor seconds of all threads so far, in steps of 0.01; 0 if the system does not report them.
 fn processor_seconds() -> f64 {
     let status = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
-    // The fields after the name, which may contain anything but this.
+    // The fields after the parenthesised name, which may contain spaces.
     let fields = status.rsplit(')').next().unwrap_or_default();
     let ticks = |field: usize| fields.split_whitespace().nth(field).and_then(|v| v.parse::<f64>().ok());
     (ticks(11).unwrap_or(0.0) + ticks(12).unwrap_or(0.0)) / 100.0
 }
 
-/// Seconds of the best of three runs, their mean processor seconds, and the memory beyond that before the first.
+/// Seconds of the best of three runs, their mean processor seconds, and the peak memory beyond that before the first.
 fn best<T>(mut run: impl FnMut() -> T) -> (f64, f64, u64) {
     // Writing 5 resets the peak (proc(5)).
     let _ = std::fs::write("/proc/self/clear_refs", "5");

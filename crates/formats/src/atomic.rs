@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Writes a file atomically: under a temporary name in the same folder, synced to the disk, then renamed to `path`. If
-/// anything fails, or the process is killed, the previous content of `path` is unchanged. A link keeps leading to the file, which is replaced; what is no file, such as a
-/// pipe or `/dev/stdout`, is written to as it is.
+/// anything fails, or the process is killed, the previous content of `path` is unchanged. A symbolic link is kept, and the file that
+/// it leads to is replaced; anything that is not a regular file, such as a pipe or `/dev/stdout`, is written to directly.
 ///
 /// # Errors
 /// [`FormatError::Write`] with the system's reason, such as a full disk; the temporary file is removed.
@@ -18,8 +18,7 @@ pub fn write_atomic(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Resul
 }
 
 fn write_beside(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> io::Result<()> {
-    // Of what is not there yet there is no other name.
-    let path = &fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
+    let path = &destination(path);
     if fs::metadata(path).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
         let mut writer = BufWriter::with_capacity(1 << 18, OpenOptions::new().write(true).open(path)?);
         write(&mut writer)?;
@@ -34,6 +33,14 @@ fn write_beside(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Result<()
     temporary.become_file(path)
 }
 
+/// Where links from `path` lead, also if there is no file yet, which has no canonical path.
+fn destination(path: &Path) -> PathBuf {
+    fs::canonicalize(path).unwrap_or_else(|_| match (fs::read_link(path), path.parent()) {
+        (Ok(target), Some(folder)) => destination(&folder.join(target)),
+        _ => path.to_owned(),
+    })
+}
+
 /// A file that is removed unless it gets its final name, even if the writing code panics.
 struct Temporary {
     path: Option<PathBuf>,
@@ -45,7 +52,7 @@ impl Temporary {
         static COUNTER: AtomicU64 = AtomicU64::new(0);
         let name = target
             .file_name()
-            .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "the path names no file"))?
+            .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "the path has no file name"))?
             .to_string_lossy()
             .into_owned();
         loop {
@@ -93,6 +100,13 @@ mod tests {
             assert!(fs::symlink_metadata(path).unwrap().is_symlink());
         }
         assert_eq!(fs::read(&file).unwrap(), b"new");
+        fs::remove_file(&file).unwrap();
+        write_atomic(&link, |w| w.write_all(b"again")).unwrap();
+        assert_eq!(
+            fs::read(&file).unwrap(),
+            b"again",
+            "a link to a file that is not there yet"
+        );
         assert!(!fs::metadata(&device).unwrap().is_file());
     }
 

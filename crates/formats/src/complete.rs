@@ -3,7 +3,7 @@
 
 use std::io::{self, BufRead, Seek};
 
-/// The end of a file, bytes, in which its last marker is usually found.
+/// Length of the end of a file, bytes, in which its last marker is usually found.
 const TAIL: u64 = 4096;
 
 /// Whether a JPEG in memory has its end-of-image marker after the start of its scan.
@@ -25,7 +25,7 @@ pub(crate) fn jpeg_is_complete(bytes: &[u8]) -> bool {
     }
 }
 
-/// [`jpeg_is_complete`] of a file, of which headers and end are read, and all of it only if the end has no marker.
+/// [`jpeg_is_complete`] for a file: reads its headers and its end, and the whole file only if the end has no marker.
 pub(crate) fn jpeg_file_is_complete(reader: &mut (impl BufRead + Seek)) -> io::Result<bool> {
     let length = reader.seek(io::SeekFrom::End(0))?;
     let mut at = 2;
@@ -54,7 +54,7 @@ pub(crate) fn jpeg_file_is_complete(reader: &mut (impl BufRead + Seek)) -> io::R
     Ok(false)
 }
 
-/// Whether a PNG's chunks lead to its `IEND`; the reader is at the start of the file, and anywhere afterwards.
+/// Whether a PNG's chunks lead to its `IEND`. The reader's position afterwards is arbitrary.
 pub(crate) fn png_is_complete(reader: &mut (impl BufRead + Seek)) -> io::Result<bool> {
     let length = reader.seek(io::SeekFrom::End(0))?;
     let mut at = 8;

@@ -125,7 +125,7 @@ fn describe_dataset(dataset: &Dataset) -> Description {
     let world = dataset.world_from_dataset;
     let trained_in = (!world.is_identity()).then(|| {
         let DVec3 { x, y, z } = world.center;
-        let origin = format!("a world about ({x:.3}, {y:.3}, {z:.3})");
+        let origin = format!("a world centred on ({x:.3}, {y:.3}, {z:.3})");
         ("trained in", format!("{origin}, in units of {}", 1.0 / world.scale))
     });
     Description {

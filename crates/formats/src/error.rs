@@ -33,7 +33,7 @@ pub enum FormatError {
         /// What is wrong with it.
         source: Malformed,
     },
-    /// The extension is of no splat format.
+    /// The extension is not one of a splat format.
     #[error("{}: not a splat file by its extension; known extensions: {known}", path.display())]
     UnknownSplatFormat {
         /// The file.
@@ -43,11 +43,11 @@ pub enum FormatError {
     },
     /// A folder without a scene.
     #[error(
-        "{} holds no scene (scene.ply, or meta.json of SOG); that of a run is written at its end: continue it with irradia train --resume",
+        "{} contains no scene (scene.ply, or meta.json of SOG); a run writes its scene at its end: continue it with irradia train --resume",
         .0.display()
     )]
     NoScene(PathBuf),
-    /// A file, where a folder is needed.
+    /// A file where a folder is needed.
     #[error(
         "{} is a file: name the folder of a dataset or of photographs; an archive must be unpacked first",
         .0.display()

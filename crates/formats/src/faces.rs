@@ -1,7 +1,8 @@
-//! Wide lenses: photographs that one pinhole image cannot show become several, the faces of a cube around the camera.
+//! Wide lenses: photographs that one pinhole image cannot show become several images, the faces of a cube around the camera.
 //!
-//! A pinhole of 90 degrees stretches its borders to twice the size of its centre, one of 150 degrees to fifteen times, and beyond 180 there is none. Faces show
-//! the whole photograph at the resolution that it has, and whatever trains on pinholes trains on them.
+//! A pinhole image of 90 degrees stretches its borders to twice the size of its centre, one of 150 degrees to fifteen times, and
+//! beyond 180 degrees there is none. Faces show the whole photograph at its own resolution, and anything that trains on pinhole images
+//! can train on them.
 
 use crate::FormatError;
 use crate::Pixels;
@@ -13,20 +14,20 @@ use irradia_scene::{Intrinsics, Lens, resize_area};
 use std::f64::consts::{FRAC_PI_2, PI};
 use std::path::Path;
 
-/// A photograph of a wide lens of which one pinhole image shows less than this is cut into faces.
+/// A photograph of a wide lens is cut into faces if one pinhole image shows less than this fraction of it.
 const SHOWN: f64 = 0.7;
-/// Samples of that along each side of the photograph.
+/// Samples along each side of the photograph by which that fraction is measured.
 const SAMPLES: u32 = 48;
-/// Smallest side of a face relative to that of the cube: less is a strip that only costs time.
+/// Minimum side of a face relative to that of the cube: a smaller face is a strip that only costs time.
 const SMALLEST: f64 = 1.0 / 8.0;
-/// Longer side of the photographs in which the image circle is searched, pixels.
+/// Longer side of the small copies in which the image circle is searched, pixels.
 const SIDE: u32 = 256;
-/// Values up to this, of 255, are the black around an image circle.
+/// Maximum value, of 255, of the black around an image circle.
 const BLACK: u8 = 20;
-/// How far within the image circle a face ends, relative to its radius: the rim is dark and blurred.
+/// Fraction of the image circle's radius that faces use: the rim is dark and blurred.
 const RIM: f64 = 0.98;
 
-/// A side of the cube around a camera: what is added to the photograph's name, and the rotation from its axes to the photograph's.
+/// A side of the cube around a camera: the suffix of the photograph's name, and the rotation from its axes to the photograph's.
 type Side = (&'static str, DQuat);
 
 /// The sides in the order of their names.
@@ -41,18 +42,18 @@ pub(crate) fn sides() -> [Side; 6] {
     ]
 }
 
-/// What pinhole images are made of the photographs of one camera.
+/// The pinhole images made from each photograph of a camera.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Cut {
-    /// One.
+    /// One image.
     Whole(Box<Undistortion>),
-    /// Several, each with what is added to the photograph's name.
+    /// Several images, each with its suffix of the photograph's name.
     Faces(Vec<(&'static str, Undistortion)>),
 }
 
 impl Cut {
-    /// One image where it shows most of a photograph, else faces, of what is in the `circle` (radians from the axis) if there is one; `None` where
-    /// the lens leaves no image.
+    /// One image if it shows most of a photograph; otherwise faces, limited to the image `circle` (radians from the axis) if there is
+    /// one. `None` if the lens leaves no valid image.
     pub fn plan(source: &Intrinsics, circle: impl FnOnce() -> Option<f64>) -> Option<Self> {
         let whole = (source.lens != Lens::Equirectangular)
             .then(|| Undistortion::plan(source))
@@ -72,7 +73,7 @@ impl Cut {
     }
 }
 
-/// The whole faces of a panorama.
+/// The six faces of a panorama.
 pub(crate) fn panorama_faces(width: u32, height: u32) -> Vec<(&'static str, Undistortion)> {
     let focal = (f64::from(width) / (2.0 * PI)) as f32;
     let source = Intrinsics {
@@ -92,7 +93,7 @@ fn angle(direction: DVec3) -> f64 {
     direction.truncate().length().atan2(direction.z)
 }
 
-/// The share of the photograph's pixels of which `plan`'s image shows what is there.
+/// The fraction of the photograph's pixels within `reach` (radians from the axis) that `plan`'s image shows.
 fn shown(source: &Intrinsics, reach: f64, plan: &Undistortion) -> f64 {
     let (mut all, mut seen) = (0u32, 0u32);
     for row in 0..SAMPLES {
@@ -109,13 +110,13 @@ fn shown(source: &Intrinsics, reach: f64, plan: &Undistortion) -> f64 {
     f64::from(seen) / f64::from(all.max(1))
 }
 
-/// The sides of a cube, as far as the photograph shows what is within `reach` of its axis: with its own resolution at their centres.
+/// The sides of a cube, cropped to what the photograph shows within `reach` (radians from its axis), at its resolution at their centres.
 fn faces(source: &Intrinsics, reach: f64) -> Vec<(&'static str, Undistortion)> {
     let focal = 0.5 * (source.fx + source.fy);
     let side = (2.0 * focal).round().max(1.0) as u32;
     let pinhole = Intrinsics::from_fov_x(side, side, FRAC_PI_2 as f32);
     let face = |(name, turn): Side| {
-        // Behind a camera that does not see straight behind it, a face would have a hole.
+        // The back face of a camera that does not see straight behind itself would have a hole.
         if turn * DVec3::Z == DVec3::NEG_Z && reach < PI {
             return None;
         }
@@ -127,8 +128,8 @@ fn faces(source: &Intrinsics, reach: f64) -> Vec<(&'static str, Undistortion)> {
     sides().into_iter().filter_map(face).collect()
 }
 
-/// The radius of the circle that a fisheye lens throws onto the sensor, as the angle from its axis in radians; `None` where the corners of
-/// the photographs are not black.
+/// The radius of a fisheye's image circle, as the angle from its axis in radians; `None` if the corners of the photographs are not
+/// black.
 ///
 /// # Errors
 /// When a photograph cannot be read.
@@ -166,14 +167,14 @@ fn values(from: &Pixels, width: u32, height: u32) -> Vec<u8> {
     data.chunks_exact(channels).map(value).collect()
 }
 
-/// See [`image_circle`]; `brightest` are the largest values of each pixel of `width` x `height`.
+/// See [`image_circle`]; `brightest` is `[height, width]`, the largest value of each pixel in any photograph.
 fn circle(source: &Intrinsics, width: u32, height: u32, brightest: &[u8]) -> Option<f64> {
     let k = source.resized(width, height);
     let corners = [0, width - 1, (height - 1) * width, height * width - 1];
     if corners.iter().any(|at| brightest[*at as usize] > BLACK) {
         return None;
     }
-    // Rings of a pixel's width, from the outermost inwards: the first that is mostly not black.
+    // Rings one pixel wide; from the outermost inwards, the first that is mostly not black.
     let ring = 1.0 / f64::from(k.fx.min(k.fy));
     let mut rings: Vec<[u32; 2]> = Vec::new();
     for (at, value) in (0u32..).zip(brightest) {
@@ -303,7 +304,7 @@ mod tests {
         assert_eq!(names, ["back", "down", "front", "left", "right", "up"]);
         for (name, plan) in faces {
             let k = plan.pinhole();
-            // 512 pixels around are 81.5 a radian.
+            // 512 pixels for a full turn are 81.5 per radian.
             assert!(
                 k.width.min(k.height) >= 161 && k.width.max(k.height) <= 163,
                 "{name} {k:?}"
@@ -314,7 +315,7 @@ mod tests {
     #[test]
     fn a_half_turn_has_a_front_and_half_of_four_sides() {
         let k = camera(Lens::fisheye([0.0; 4]), 314, 314, [100.0; 2]);
-        // What is in the corners is more than a half turn away and in no photograph of such a lens.
+        // The corners are beyond the half turn, and would be black in a photograph of such a lens.
         let Some(Cut::Faces(faces)) = Cut::plan(&k, || Some(FRAC_PI_2)) else {
             panic!("faces")
         };

@@ -1,4 +1,4 @@
-//! HEIC, the format of phones' photographs: pictures coded as HEVC in a HEIF container (ISO/IEC 23008-12), as an [`ImageDecoder`].
+//! HEIC, the format of phones' photographs: images coded as HEVC in a HEIF container (ISO/IEC 23008-12), as an [`ImageDecoder`].
 
 use heifer::heifer_isobmff::boxes::Property;
 use heifer::heifer_isobmff::{HeifFile, ItemId};
@@ -7,29 +7,29 @@ use image::error::{DecodingError, ImageFormatHint};
 use image::metadata::Orientation;
 use image::{ColorType, ImageDecoder, ImageError, ImageResult};
 
-/// Above the largest sensors of phones, 200 megapixels; a damaged file may state any size.
+/// Maximum number of pixels, above the largest sensors of phones (200 megapixels); a damaged file may declare any size.
 const MAX_PIXELS: u64 = 1 << 28;
 
-/// Photographs are decoded many at a time; a second layer of threads would only contend with them.
+/// Many photographs are decoded at a time; more threads per photograph would only contend with each other.
 const ONE_THREAD: Options = Options {
     max_threads: 1,
     max_pixels: MAX_PIXELS,
 };
 
-/// Kinds of auxiliary pictures that are alpha (ISO/IEC 23008-12, 6.5.8 and annex B).
+/// Kinds of auxiliary images that hold alpha (ISO/IEC 23008-12, 6.5.8 and annex B).
 const ALPHA: [&str; 2] = [
     "urn:mpeg:hevc:2015:auxid:1",
     "urn:mpeg:mpegB:cicp:systems:auxiliary:alpha",
 ];
 
-/// A HEIC file whose container was read, and whose pixels were not.
+/// A HEIC file whose container has been read, but not its pixels.
 pub(crate) struct HeicDecoder {
     bytes: Vec<u8>,
     size: (u32, u32),
     has_alpha: bool,
 }
 
-/// Whether a file that begins with `start` is in a container of HEIF; what codes its pictures is found in it.
+/// Whether a file that begins with `start` is a HEIF container; the codec of its images is declared further inside.
 pub(crate) fn is_heif(start: &[u8]) -> bool {
     const BRANDS: [&[u8]; 6] = [b"heic", b"heix", b"heim", b"heis", b"mif1", b"mif2"];
     start.get(4..8) == Some(b"ftyp") && start.get(8..12).is_some_and(|brand| BRANDS.contains(&brand))
@@ -39,14 +39,14 @@ impl HeicDecoder {
     /// Reads the container of a file's `bytes`.
     ///
     /// # Errors
-    /// When it is damaged, or ends before the pictures that it lists.
+    /// When it is damaged, or ends before the images that it lists.
     pub fn new(bytes: Vec<u8>) -> ImageResult<Self> {
         let (size, has_alpha) = read_container(&bytes).map_err(undecodable)?;
         Ok(Self { bytes, size, has_alpha })
     }
 }
 
-/// The size of the primary picture as it is displayed, and whether it has alpha.
+/// The size of the primary image as displayed, and whether it has alpha.
 fn read_container(bytes: &[u8]) -> Result<((u32, u32), bool), heifer::Error> {
     let file = HeifFile::parse(bytes)?;
     let picture = file.primary_id;
@@ -63,12 +63,12 @@ fn read_container(bytes: &[u8]) -> Result<((u32, u32), bool), heifer::Error> {
     let has_alpha = file.referencing_items(picture, b"auxl").into_iter().any(is_alpha);
     let (width, height) = displayed_size(&file, picture)?;
     if u64::from(width) * u64::from(height) > MAX_PIXELS {
-        return Err(heifer::Error::Invalid("a picture of more than 268 megapixels"));
+        return Err(heifer::Error::Invalid("more than 268 megapixels"));
     }
     Ok(((width, height), has_alpha))
 }
 
-/// The size of a picture once it is cropped and turned, in the order in which its file says so.
+/// The size of an image after it is cropped and rotated, in the order that its file gives.
 fn displayed_size(file: &HeifFile, picture: ItemId) -> Result<(u32, u32), heifer::Error> {
     let no_size = heifer::Error::Invalid("no size");
     let (mut width, mut height) = file.image_size(picture)?.ok_or(no_size)?;
@@ -90,7 +90,7 @@ fn displayed_size(file: &HeifFile, picture: ItemId) -> Result<(u32, u32), heifer
     Ok((width, height))
 }
 
-/// What is left of `side` pixels by an aperture of `length` pixels, `offset` from the middle, both as fractions.
+/// The number of `side` pixels that remain in an aperture of `length` pixels, `offset` from the middle; both are given as fractions.
 fn cropped(side: u32, length: (u32, u32), offset: (i32, u32)) -> u32 {
     let length = f64::from(length.0) / f64::from(length.1);
     let middle = f64::from(offset.0) / f64::from(offset.1) + (f64::from(side) - 1.0) / 2.0;
@@ -116,7 +116,7 @@ impl ImageDecoder for HeicDecoder {
         Ok(metadata.exif)
     }
 
-    /// None is left: the container says how pictures are turned, and its decoder turns them. What EXIF says is informative.
+    /// Always none: the container declares the rotation, and its decoder applies it. EXIF orientation is only informative.
     fn orientation(&mut self) -> ImageResult<Orientation> {
         Ok(Orientation::NoTransforms)
     }
@@ -124,7 +124,7 @@ impl ImageDecoder for HeicDecoder {
     fn read_image(self, out: &mut [u8]) -> ImageResult<()> {
         let picture = decode_rgba8(&self.bytes, &ONE_THREAD).map_err(undecodable)?;
         if (picture.width, picture.height) != self.size {
-            return Err(undecodable(heifer::Error::Invalid("not of the size that it states")));
+            return Err(undecodable(heifer::Error::Invalid("not of the size that it declares")));
         }
         let channels = usize::from(self.color_type().channel_count());
         for (to, from) in out.chunks_exact_mut(channels).zip(picture.data.as_chunks::<4>().0) {

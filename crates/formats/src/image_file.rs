@@ -32,7 +32,7 @@ pub(crate) struct Header {
     pub width: u32,
     /// As stored, before orientation.
     pub height: u32,
-    /// The EXIF orientation to apply to see the picture upright.
+    /// The EXIF orientation to apply for an upright image.
     pub orientation: Orientation,
     /// Whether it is a JPEG, which can be decoded at a fraction of its size.
     pub jpeg: bool,
@@ -47,7 +47,8 @@ pub(crate) enum Colour {
     Grey,
 }
 
-/// Reads a JPEG, PNG, WebP, TIFF, HEIC or `OpenEXR` of any depth as 3 or (if the file has alpha) 4 channels of 8 bits, with the EXIF orientation applied.
+/// Reads a JPEG, PNG, WebP, TIFF, HEIC or `OpenEXR` of any depth as 3 or (if the file has alpha) 4 channels of 8 bits, with the EXIF
+/// orientation applied.
 ///
 /// # Errors
 /// When the file cannot be read, is not an image, or is truncated.
@@ -107,13 +108,14 @@ pub fn write_png_16(path: &Path, width: u32, height: u32, data: &[u16]) -> Resul
 }
 
 impl Header {
-    /// Whether its picture lies or stands as one of `upright` size does.
+    /// Whether the stored image is landscape or portrait like an image of `upright` size.
     pub fn lies_as(&self, (width, height): (u32, u32)) -> bool {
         (self.width > self.height) == (width > height)
     }
 
-    /// The orientation of a file beside a photograph of this orientation and `upright` size: masks and maps are made from the pixels as displayed
-    /// by some tool and rarely have EXIF data, so that one with the aspect of the stored photograph is turned with it.
+    /// The orientation to apply to this mask or map of a photograph that has the orientation `photograph` and the size `upright`. Masks
+    /// and maps are made from the pixels as some tool displays them and rarely have EXIF data, so one with the aspect of the stored
+    /// photograph is rotated like it.
     pub fn turned_with(&self, photograph: Orientation, upright: (u32, u32)) -> Orientation {
         if self.lies_as(upright) {
             Orientation::NoTransforms
@@ -136,7 +138,7 @@ pub(crate) fn read_header(path: &Path) -> Result<Header, FormatError> {
             format!("an image of {width}x{height} pixels"),
         ));
     }
-    // A broken EXIF block does not make a picture unusable.
+    // A broken EXIF block does not make an image unusable.
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     Ok(Header {
         width,
@@ -146,7 +148,7 @@ pub(crate) fn read_header(path: &Path) -> Result<Header, FormatError> {
     })
 }
 
-/// The header of a JPEG, of which only the headers and the end are read; `None` if it is not a JPEG, or needs the other decoder.
+/// The header of a JPEG; reads only the file's headers and end. `None` if it is not a JPEG, or needs the other decoder.
 fn read_jpeg_header(path: &Path) -> Result<Option<Header>, FormatError> {
     let read = |source| FormatError::Read {
         path: path.to_owned(),
@@ -173,7 +175,7 @@ fn read_jpeg_header(path: &Path) -> Result<Option<Header>, FormatError> {
         }))
 }
 
-/// What cameras write beside the pixels; empty where nothing can be read.
+/// What cameras write beside the pixels; empty if nothing can be read.
 #[derive(Default)]
 pub(crate) struct Metadata {
     /// The EXIF block, beginning with its TIFF header.
@@ -210,7 +212,7 @@ pub(crate) fn decode(path: &Path, orientation: Orientation, colour: Colour) -> R
     Ok(upright(image, orientation, colour))
 }
 
-/// The pixels of a mask, 0 to 255, also where it has 0 and 1 for them.
+/// The pixels of a mask, 0 to 255; a mask of zeros and ones is scaled to that range.
 pub(crate) fn decode_mask(path: &Path, orientation: Orientation) -> Result<Pixels, FormatError> {
     let mut mask = decode(path, orientation, Colour::Grey)?;
     if mask.data.iter().max() == Some(&1) {
@@ -219,31 +221,31 @@ pub(crate) fn decode_mask(path: &Path, orientation: Orientation) -> Result<Pixel
     Ok(mask)
 }
 
-/// The pixels of a HEIC in memory.
+/// The pixels of a HEIC image in memory.
 pub(crate) fn decode_heic(bytes: &[u8]) -> Result<Pixels, image::ImageError> {
     let image = DynamicImage::from_decoder(HeicDecoder::new(bytes.to_vec())?)?;
     Ok(upright(image, Orientation::NoTransforms, Colour::Keep))
 }
 
-/// The pixels of an `OpenEXR` in memory.
+/// The pixels of an `OpenEXR` image in memory.
 pub(crate) fn decode_exr(bytes: &[u8]) -> Result<Pixels, image::ImageError> {
     let image = DynamicImage::from_decoder(ExrDecoder::new(Cursor::new(bytes))?)?;
     Ok(upright(image, Orientation::NoTransforms, Colour::Keep))
 }
 
-/// The values of a grey image, those of 8 and 16 bits and of `OpenEXR` as they are stored: width, height and `[H, W]`.
+/// The values of a grey image as stored (8 bits, 16 bits or `OpenEXR`): width, height and `[H, W]`.
 ///
 /// # Errors
 /// When it cannot be decoded or is in colour.
 pub(crate) fn decode_values(path: &Path, orientation: Orientation) -> Result<(u32, u32, Vec<f32>), FormatError> {
     let in_colours = || {
-        let message = "is a picture in colours, not a map of values; store these as grey of 8 or 16 bits, as OpenEXR of one channel, or as .npy";
+        let message = "is a colour image, not a map of values; store the values as 8- or 16-bit grey, single-channel OpenEXR, or .npy";
         FormatError::malformed(path, message)
     };
     if let Some(decoder) = open_exr(path)? {
         let read = decoder.read_depths().map_err(|error| undecodable(path, &error))?;
         let (width, height, values) = read.ok_or_else(in_colours)?;
-        // No picture of one channel of floats can be turned.
+        // Three equal channels, since an image of one float channel cannot be rotated.
         let thrice = values.into_iter().flat_map(|value| [value; 3]).collect();
         let image = Rgb32FImage::from_raw(width, height, thrice).ok_or_else(in_colours)?;
         let mut image = DynamicImage::from(image);
@@ -268,7 +270,7 @@ pub(crate) fn decode_values(path: &Path, orientation: Orientation) -> Result<(u3
     Ok((width, height, values))
 }
 
-/// The normals that an image holds: width, height and `[H, W]`. Of `OpenEXR` the values as they are, of other files colours, `n = 2 c - 1`.
+/// The normals in an image: width, height and `[H, W]`. `OpenEXR` stores the values themselves, other files colours, `n = 2 c - 1`.
 ///
 /// # Errors
 /// When it cannot be decoded, or is an `OpenEXR` without three channels of one layer.
@@ -276,7 +278,7 @@ pub(crate) fn decode_normals(path: &Path) -> Result<(u32, u32, Vec<[f32; 3]>), F
     if let Some(decoder) = open_exr(path)? {
         let vectors = decoder.read_vectors().map_err(|error| undecodable(path, &error))?;
         return vectors
-            .ok_or_else(|| FormatError::malformed(path, "has no three channels R, G, B or X, Y, Z; make it again"));
+            .ok_or_else(|| FormatError::malformed(path, "lacks the channels R, G, B or X, Y, Z; create it again"));
     }
     let (decoder, _) = open(path)?;
     let image = DynamicImage::from_decoder(decoder).map_err(|error| undecodable(path, &error))?;
@@ -291,7 +293,7 @@ pub(crate) fn decode_normals(path: &Path) -> Result<(u32, u32, Vec<[f32; 3]>), F
     ))
 }
 
-/// The value of a colour that is grey.
+/// The value of a grey colour; `None` for other colours.
 fn grey<T: PartialEq + Copy>([red, green, blue]: [T; 3]) -> Option<T> {
     (red == green && green == blue).then_some(red)
 }
@@ -313,8 +315,8 @@ fn upright(mut image: DynamicImage, orientation: Orientation, colour: Colour) ->
     }
 }
 
-/// The pixels of a JPEG at 1 / `divisor` of its size, rounded up, with `orientation` applied. Of each block of 8 x 8 pixels, only the
-/// low frequencies are transformed, for `divisor` 2, 4 or 8 (ITU-T T.81, A.3.3); this takes a fraction of the time and memory.
+/// The pixels of a JPEG at 1 / `divisor` of its size, rounded up, with `orientation` applied. For `divisor` 2, 4 or 8, only the low
+/// frequencies of each block of 8 x 8 pixels are transformed (ITU-T T.81, A.3.3), which takes a fraction of the time and memory.
 pub(crate) fn decode_jpeg_at(path: &Path, divisor: u32, orientation: Orientation) -> Result<Pixels, FormatError> {
     let read = |source| FormatError::Read {
         path: path.to_owned(),
@@ -343,7 +345,7 @@ pub(crate) fn decode_jpeg_at(path: &Path, divisor: u32, orientation: Orientation
     let image = match info.map(|info| info.pixel_format) {
         Some(jpeg_decoder::PixelFormat::L8) => GrayImage::from_raw(width, height, data).map(DynamicImage::from),
         Some(jpeg_decoder::PixelFormat::RGB24) => RgbImage::from_raw(width, height, data).map(DynamicImage::from),
-        // Other kinds are rare: at full size, then averaged.
+        // Other pixel formats are rare: decoded at full size, then averaged.
         _ => None,
     };
     if let Some(image) = image {
@@ -370,7 +372,7 @@ fn truncated(path: &Path) -> FormatError {
 trait Source: BufRead + Seek {}
 impl<T: BufRead + Seek> Source for T {}
 
-/// The decoder of a file in `OpenEXR`; `None` if it is in another format.
+/// The decoder of an `OpenEXR` file; `None` if it has another format.
 fn open_exr(path: &Path) -> Result<Option<ExrDecoder<BufReader<File>>>, FormatError> {
     let unread = |source| FormatError::Read {
         path: path.to_owned(),
@@ -384,7 +386,7 @@ fn open_exr(path: &Path) -> Result<Option<ExrDecoder<BufReader<File>>>, FormatEr
     Ok(Some(decoder))
 }
 
-/// Opens an image that is not truncated; the format is detected by its first bytes. Returns whether it is a JPEG.
+/// Opens an image, and returns whether it is a JPEG; the format is detected by the first bytes. A truncated file is an error.
 fn open(path: &Path) -> Result<(Box<dyn ImageDecoder>, bool), FormatError> {
     let unread = |source| FormatError::Read {
         path: path.to_owned(),

@@ -1,6 +1,6 @@
-//! Files in, files out: datasets of posed photographs, splat scenes, point clouds, pictures, and other programs' tensors.
+//! Reads and writes files: datasets of posed photographs, splat scenes, point clouds, images, and other programs' tensors.
 //!
-//! Foreign conventions stop in this crate: whatever a file means by a pose, a pixel or a colour, results follow the
+//! Foreign conventions are converted in this crate: however a file defines poses, pixels or colours, results follow the
 //! conventions of [`irradia_scene`]. The parsers in [`parse`] take bytes and are fuzzed; no input makes them panic, and no
 //! size that a file declares is allocated before it is compared with the size of the file.
 #![forbid(unsafe_code)]

@@ -1,4 +1,4 @@
-//! Maps of depth and of normals that were given beside photographs: images of 8 or 16 bits and `OpenEXR`, depths also as `.npy` arrays.
+//! Depth maps and normal maps given beside photographs: images of 8 or 16 bits, `OpenEXR`, and for depths `.npy` arrays.
 
 use crate::FormatError;
 use crate::dataset::parse_table;
@@ -9,18 +9,19 @@ use image::metadata::Orientation;
 use irradia_scene::{Grid, GridSource, LoadError};
 use std::path::PathBuf;
 
-/// Cells of a grid along its longer side: what a network or a phone's sensor resolves, at little memory (48 KB of depths a photograph).
+/// Cells of a grid along its longer side: about what a network or a phone's sensor resolves, at little memory (48 KB of depths per
+/// photograph).
 const CELLS: u32 = 128;
 
 /// A map on disk with the operations to apply when it is loaded.
 #[derive(Clone, Debug)]
 pub(crate) struct MapFile {
     pub path: PathBuf,
-    /// That of the photograph.
+    /// Orientation of the photograph.
     pub orientation: Orientation,
     /// Size of the upright photograph.
     pub upright: (u32, u32),
-    /// That of the photograph, with its axis unturned: depths along +Z and normals stay what they are.
+    /// Undistortion of the photograph, without a rotation: depths along +Z and normals keep their values.
     pub undistortion: Option<Undistortion>,
 }
 
@@ -47,7 +48,7 @@ impl GridSource<[f32; 3]> for MapFile {
 }
 
 impl MapFile {
-    /// The grid over the photograph as it is trained on; `unknown` where the map has nothing.
+    /// The map as a grid over the photograph as it is trained on; `unknown` where the map has no value.
     fn sampled<T: Copy>(&self, (width, height, values): Values<T>, unknown: T) -> Grid<T> {
         let shown = self.undistortion.map_or(self.upright, |plan| {
             let pinhole = plan.pinhole();
@@ -62,7 +63,7 @@ impl MapFile {
                 None => [x, y],
                 Some(plan) => plan.place_in_photograph([x, y])?,
             };
-            // The nearest value: a mean over an edge is that of nothing.
+            // The nearest value: a mean across an edge is the depth of neither side.
             let index = |at: f64, side: u32| ((at * f64::from(side)) as usize).min(side as usize - 1);
             Some(values[index(y, height) * width as usize + index(x, width)])
         };
@@ -76,12 +77,12 @@ impl MapFile {
         }
     }
 
-    /// Upright.
+    /// The depths, upright.
     fn depths(&self) -> Result<Values<f32>, FormatError> {
         if self.path.extension().is_some_and(|extension| extension == "npy") {
             let table = read_and_parse(&self.path, parse_table)?;
             if table.rows == 0 || table.columns == 0 {
-                return Err(FormatError::malformed(&self.path, "has no values; make it again"));
+                return Err(FormatError::malformed(&self.path, "has no values; create it again"));
             }
             let values = table.values.iter().map(|value| *value as f32).collect();
             return Ok((table.columns as u32, table.rows as u32, values));
@@ -90,10 +91,10 @@ impl MapFile {
         decode_values(&self.path, orientation)
     }
 
-    /// Only upright: turned pixels would have turned axes.
+    /// The normals. The file must be upright: if its pixels had to be rotated, so would the axes of its normals.
     fn normals(&self) -> Result<Values<[f32; 3]>, FormatError> {
         if !read_header(&self.path)?.lies_as(self.upright) {
-            let message = "is not upright, as its photograph is; make it again from the upright photograph";
+            let message = "is not upright like its photograph; create it again from the upright photograph";
             return Err(FormatError::malformed(&self.path, message));
         }
         decode_normals(&self.path)

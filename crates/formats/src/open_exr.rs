@@ -1,4 +1,4 @@
-//! `OpenEXR`: linear colours by renderers, as an [`ImageDecoder`], and depths and normals by renderers and phones, as they are stored.
+//! `OpenEXR`: linear colours from renderers, as an [`ImageDecoder`], and depths and normals from renderers and phones, as stored.
 
 use exr::error::Error;
 use exr::image::{AnyChannel, FlatSamples};
@@ -10,14 +10,14 @@ use image::{ColorType, ImageDecoder, ImageError, ImageResult};
 use irradia_scene::srgb_from_linear;
 use std::io::{BufRead, Read, Seek, SeekFrom};
 
-/// Above the largest renders and sensors; a damaged file may state any size.
+/// Maximum number of pixels, above the largest renders and sensors; a damaged file may declare any size.
 const MAX_PIXELS: usize = 1 << 28;
-/// More than the best compression (of one colour, about 1,000 bytes by one) leaves.
-const PIXELS_PER_BYTE: u64 = 4096;
-/// Last parts of the names of channels that hold depths, in the order of preference.
+/// Maximum number of decoded bytes per byte of a file, more than the best compression achieves (of a single colour, about 1,000 to one).
+const DECODED_PER_BYTE: u64 = 4096;
+/// Last parts of the names of channels that hold depths, in order of preference.
 const DEPTHS: [&str; 5] = ["Z", "Depth", "V", "Y", "R"];
 
-/// A file whose header was read, and whose pixels were not.
+/// A file whose header has been read, but not its pixels.
 pub(crate) struct ExrDecoder<R> {
     source: R,
     size: [usize; 2],
@@ -36,10 +36,10 @@ pub(crate) fn is_exr(start: &[u8]) -> bool {
 }
 
 impl<R: BufRead + Seek> ExrDecoder<R> {
-    /// Reads the header of `source`, and where its pixels lie.
+    /// Reads the header of `source` and the offsets of its pixels.
     ///
     /// # Errors
-    /// When it is damaged or ends too early, or has no picture but layers of several samples a pixel ("deep").
+    /// When it is damaged or ends too early, or has only layers of several samples per pixel ("deep").
     pub fn new(mut source: R) -> ImageResult<Self> {
         let (size, has_alpha) = read_header(&mut source).map_err(undecodable)?;
         Ok(Self {
@@ -49,7 +49,7 @@ impl<R: BufRead + Seek> ExrDecoder<R> {
         })
     }
 
-    /// Depths: width, height and `[H, W]`. `None` if the file shows colours.
+    /// Depths: width, height and `[H, W]`. `None` if the file holds colours.
     pub fn read_depths(self) -> ImageResult<Option<(u32, u32, Plane)>> {
         let size = self.size.map(|side| side as u32);
         let mut channels = self.read_channels().map_err(undecodable)?;
@@ -88,7 +88,7 @@ impl<R: BufRead + Seek> ExrDecoder<R> {
         let (layer, window) = (image.layer_data, image.attributes.display_window);
         let (size, offset) = (layer.size, layer.attributes.layer_position - window.position);
         let place = |channel: AnyChannel<FlatSamples>| {
-            // Subsampled ones are differences of chroma.
+            // Subsampled channels are chroma differences.
             let is_whole = channel.sampling == Vec2(1, 1) && channel.sample_data.len() == size.area();
             is_whole.then(|| {
                 (
@@ -103,10 +103,10 @@ impl<R: BufRead + Seek> ExrDecoder<R> {
     }
 }
 
-/// The size of the picture, and whether it has alpha.
+/// The size of the image, and whether it has alpha.
 fn read_header(source: &mut (impl BufRead + Seek)) -> Result<([usize; 2], bool), Error> {
     let meta = MetaData::read_from_buffered(&mut *source, false)?;
-    // The table of where each block of pixels begins: a file that was cut off ends before the last of them.
+    // The offset table of the blocks of pixels: a truncated file ends before its last block.
     let blocks: usize = meta.headers.iter().map(|header| header.chunk_count).sum();
     let mut table = Vec::new();
     (&mut *source).take(8 * blocks as u64).read_to_end(&mut table)?;
@@ -129,7 +129,8 @@ fn read_header(source: &mut (impl BufRead + Seek)) -> Result<([usize; 2], bool),
     let Vec2(width, height) = header.shared_attributes.display_window.size;
     let area = |size: Vec2<usize>| size.0.saturating_mul(size.1);
     let pixels = area(header.layer_size).max(width.saturating_mul(height));
-    if pixels > MAX_PIXELS || width.min(height) == 0 || pixels as u64 / PIXELS_PER_BYTE > end {
+    let decoded = (pixels as u64).saturating_mul(header.channels.bytes_per_pixel as u64);
+    if pixels > MAX_PIXELS || width.min(height) == 0 || decoded / DECODED_PER_BYTE > end {
         return Err(Error::NotSupported(
             format!("{width}x{height} pixels in {end} bytes").into(),
         ));
@@ -145,7 +146,7 @@ fn read_header(source: &mut (impl BufRead + Seek)) -> Result<([usize; 2], bool),
     Ok(([width, height], channels.alpha().is_some()))
 }
 
-/// What a layer shows, `size` pixels from `offset`, in a picture of `to` pixels; zero outside.
+/// The samples of a layer of `size` pixels at `offset`, placed in an image of `to` pixels; zero outside the layer.
 fn placed(samples: &FlatSamples, size: Vec2<usize>, offset: Vec2<i32>, to: [usize; 2]) -> Plane {
     let values: Plane = samples.values_as_f32().collect();
     if (size, offset) == (Vec2(to[0], to[1]), Vec2(0, 0)) {
@@ -166,7 +167,7 @@ fn placed(samples: &FlatSamples, size: Vec2<usize>, offset: Vec2<i32>, to: [usiz
         .collect()
 }
 
-/// Channels by name. The last part of a name, after a point, is the channel's own; what is before it is that of its layer.
+/// Channels by name. The part of a name after the last dot is the channel's own name; the part before it is its layer's.
 struct Channels {
     of: Vec<(String, Plane)>,
 }
@@ -182,7 +183,7 @@ impl Channels {
         self.of.iter().position(|(name, _)| is_one(name))
     }
 
-    /// Channels of these names in one layer.
+    /// The channels with these names in one layer.
     fn three(&self, names: [&str; 3]) -> Option<[usize; 3]> {
         self.of.iter().find_map(|(name, _)| {
             let layer = name
@@ -211,9 +212,9 @@ impl Channels {
     }
 }
 
-/// An 8-bit value of a linear one; above 1 it is white.
+/// The 8-bit sRGB value of a linear one; values above 1 are white.
 fn byte(linear: f32) -> u8 {
-    // Not a number becomes zero in the conversion.
+    // NaN becomes zero in the conversion.
     (255.0 * srgb_from_linear(linear.clamp(0.0, 1.0))).round() as u8
 }
 
@@ -230,7 +231,7 @@ impl<R: BufRead + Seek> ImageDecoder for ExrDecoder<R> {
         }
     }
 
-    /// Linear values from 0 to 1 as sRGB, grey where there is one channel. Colours are stored multiplied with alpha, and become straight.
+    /// Linear values from 0 to 1 as sRGB, grey if there is one channel. Stored colours are multiplied by alpha; the result's are not.
     fn read_image(self, out: &mut [u8]) -> ImageResult<()> {
         let has_alpha = self.has_alpha;
         let channels = self.read_channels().map_err(undecodable)?;
@@ -275,7 +276,7 @@ mod tests {
     use image::DynamicImage;
     use std::io::Cursor;
 
-    /// A file of `size` pixels with these channels, from pixel `offset` of a picture of `shown` pixels.
+    /// A file with one layer of `size` pixels with these channels, at `offset` in an image of `shown` pixels.
     fn file(size: [usize; 2], offset: [i32; 2], shown: [usize; 2], channels: &[(&str, FlatSamples)]) -> Vec<u8> {
         let list: SmallVec<[AnyChannel<FlatSamples>; 4]> = channels
             .iter()

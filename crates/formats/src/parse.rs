@@ -23,12 +23,12 @@ pub use crate::splats::ply::parse_splat_ply as splat_ply;
 pub use crate::splats::sog::parse as sog;
 pub use crate::splats::spz::parse as spz;
 
-/// A `.gltf` file, without other files beside it.
+/// A `.gltf` file that contains its buffers.
 ///
 /// # Errors
 /// The same as for [`glb`].
 pub fn gltf(text: &[u8]) -> Result<irradia_scene::GaussianCloud, crate::Malformed> {
-    let absent = |_: &str| Err(crate::Malformed("its buffer is another file".into()));
+    let absent = |_: &str| Err(crate::Malformed("its buffer is in another file".into()));
     crate::splats::gltf::parse_gltf(text, &absent)
 }
 
@@ -40,10 +40,10 @@ pub fn heic(bytes: &[u8]) -> Result<crate::Pixels, crate::Malformed> {
     crate::image_file::decode_heic(bytes).map_err(|error| crate::Malformed(error.to_string()))
 }
 
-/// The pixels of an `OpenEXR`: width, height, and 3 or 4 channels of 8 bits.
+/// The pixels of an `OpenEXR` image: width, height, and 3 or 4 channels of 8 bits.
 ///
 /// # Errors
-/// When it is damaged, or shows no colours.
+/// When it is damaged, or has no colours.
 pub fn exr(bytes: &[u8]) -> Result<crate::Pixels, crate::Malformed> {
     crate::image_file::decode_exr(bytes).map_err(|error| crate::Malformed(error.to_string()))
 }
@@ -56,10 +56,10 @@ pub fn tensors(bytes: &[u8]) -> Result<std::collections::BTreeMap<String, crate:
     crate::tensors::parse(bytes, &|_| true)
 }
 
-/// The number of cameras in an XML by Metashape.
+/// The number of cameras in an XML file by Metashape.
 ///
 /// # Errors
-/// When it is not XML, has no cameras, or a lens that is not supported.
+/// When it is not XML, has no cameras, or has a lens that is not supported.
 pub fn metashape(bytes: &[u8]) -> Result<usize, crate::Malformed> {
     crate::dataset::metashape::parse_metashape(bytes).map(|cameras| cameras.len())
 }

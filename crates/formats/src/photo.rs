@@ -7,7 +7,7 @@ use image::metadata::Orientation;
 use irradia_scene::{LoadError, Part, Photo, PhotoSource, resize_area, resize_part};
 use std::path::{Path, PathBuf};
 
-/// Mask values from here on include the pixel in training.
+/// Minimum mask value of pixels that are included in training.
 const MASK_THRESHOLD: u8 = 128;
 
 /// A photograph on disk with the operations to apply when it is loaded.
@@ -22,7 +22,7 @@ pub(crate) struct PhotoFile {
     /// Size after orientation, from the header when the dataset was read.
     pub upright: (u32, u32),
     pub undistortion: Option<Undistortion>,
-    /// What a photograph that is not undistorted shows, if not all.
+    /// The usable part of a photograph that is not undistorted; `None` if all of it is usable.
     pub shown: Option<Shown>,
     /// Size of the resulting photograph.
     pub size: (u32, u32),
@@ -47,14 +47,14 @@ impl PhotoSource for PhotoFile {
     fn working_bytes(&self) -> usize {
         let divisor = self.divisor(self.size) as usize;
         let pixels = self.upright.0 as usize * self.upright.1 as usize / (divisor * divisor);
-        // The file, the pixels as decoded with their planes, and undistorted.
+        // The file, the decoded pixels with their planes, and the undistorted pixels.
         10 * pixels
     }
 }
 
 impl PhotoFile {
-    /// The fraction of its size, as a divisor of both sides, at which the file is decoded for a photograph of `size`: more than 1 only
-    /// for JPEG above [`DEFAULT_MAX_SIDE`], so that it takes less time. It depends on sizes alone.
+    /// The divisor of both sides at which the file is decoded for a photograph of `size`: more than 1 only for JPEG above
+    /// [`DEFAULT_MAX_SIDE`], to save time. It depends on sizes alone.
     fn divisor(&self, size: (u32, u32)) -> u32 {
         if !self.jpeg || self.upright.0.max(self.upright.1) <= DEFAULT_MAX_SIDE {
             return 1;
@@ -106,8 +106,8 @@ impl PhotoFile {
         })
     }
 
-    /// Where the photograph lies in the file decoded at 1 / `divisor` of its size: pixels at the right and the lower edge of the file are partly beyond it
-    /// if the divisor does not divide its sides.
+    /// Where the photograph lies in the file decoded at 1 / `divisor` of its size: if the divisor does not divide the sides, pixels at
+    /// the right and the lower edge of the file lie partly beyond the photograph.
     fn part(&self, divisor: u32) -> Part {
         let size = [self.upright.0, self.upright.1].map(|side| f64::from(side) / f64::from(divisor));
         let beyond = size.map(|side| side.ceil() - side);
@@ -244,7 +244,7 @@ mod tests {
                 let [a, b] = [&file, &whole].map(|photo| photo.load().unwrap());
                 let off = |(a, b): (&u8, &u8)| f64::from(a.abs_diff(*b));
                 let mean = a.data.iter().zip(&b.data).map(off).sum::<f64>() / a.data.len() as f64;
-                // On the wrong side by what lies beyond the file they differ by 10.
+                // With the partial pixels on the wrong side, they would differ by 10.
                 assert!(mean < 1.5, "{orientation:?}: {mean}");
             }
         }

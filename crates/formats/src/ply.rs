@@ -1,4 +1,4 @@
-//! The PLY container: the header, and the rows of one element as fixed-size scalars in whatever encoding.
+//! The PLY container: the header, and the rows of one element as fixed-size scalars, whatever the encoding.
 
 use crate::Malformed;
 use irradia_scene::Scalar;
@@ -7,7 +7,7 @@ use std::borrow::Cow;
 /// A header is a few kilobytes; a file without `end_header` is not searched to its end.
 const MAX_HEADER: usize = 1 << 20;
 
-/// The type of this name in a header.
+/// The type that has this name in a header.
 fn scalar_of(name: &str) -> Option<Scalar> {
     Some(match name {
         "char" | "int8" => Scalar::I8,
@@ -329,7 +329,7 @@ impl Column {
         }
     }
 
-    /// The value in `row` as bits; other types than `uint` are converted.
+    /// The value in `row` as bits; types other than `uint` are converted.
     pub fn u32(self, row: &[u8]) -> u32 {
         match self.scalar {
             Scalar::U32 => u32::from_ne_bytes(self.native(row)),

@@ -1,20 +1,20 @@
-//! What photographs show that keep the distortion of their lens.
+//! The usable part of photographs that keep the distortion of their lens.
 
 use glam::DVec2;
 use irradia_scene::{Intrinsics, Lens};
 use std::f64::consts::PI;
 
-/// How far from the axis a perspective lens is followed to find its fold: the tangent of 80 degrees.
+/// Distance from the axis up to which a perspective lens is searched for its fold: the tangent of 80 degrees.
 const STEEPEST: f64 = 5.671;
-/// Radians from the axis up to which a fisheye has directions: straight behind it there is none.
+/// Maximum angle of a fisheye from its axis, radians: straight behind the camera, the position in the photograph is ambiguous.
 const ALMOST_BEHIND: f64 = PI - 1e-6;
-/// Latitude, radians, up to which a panorama is used: beyond it splats cover many longitudes, which their affine approximations do not follow. 75
-/// degrees leave out 3 % of all directions.
+/// Maximum latitude used of a panorama, radians: beyond it, splats cover many longitudes, which their affine approximations do not
+/// follow. 75 degrees leave out 3 % of all directions.
 const HIGHEST: f64 = 75.0 * PI / 180.0;
-/// Longitude, radians, up to which a panorama is used: a splat that crosses the edge straight behind appears at one side only. 176 degrees.
+/// Maximum longitude used of a panorama, radians (176 degrees): a splat that crosses the edge straight behind appears on one side only.
 const FARTHEST: f64 = 176.0 * PI / 180.0;
 
-/// The part of the photographs of a camera that is compared with what is rendered through its lens.
+/// The part of a camera's photographs that is compared with renderings through its lens.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Shown {
     source: Intrinsics,
@@ -24,7 +24,7 @@ pub(crate) struct Shown {
 /// A region of the lens's plane.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Region {
-    /// The disc that the lens throws onto the sensor, or in which its model can be inverted; its radius.
+    /// A disc of this radius: the image circle, or the region in which the lens model can be inverted.
     Disc(f64),
     /// Panoramas without their poles and their edges.
     Band,
@@ -40,8 +40,8 @@ impl Region {
 }
 
 impl Shown {
-    /// The part of photographs of `source`; `None` if it is all. `rim` is the angle from the axis, radians, at which photographs of a fisheye become
-    /// black.
+    /// The usable part of photographs by `source`; `None` if all of it is usable. `rim` gives the angle from the axis, radians, at which
+    /// photographs of a fisheye become black.
     pub fn of(source: &Intrinsics, rim: impl FnOnce() -> Option<f64>) -> Option<Self> {
         let lens = &source.lens;
         let region = match lens {
@@ -69,7 +69,7 @@ impl Shown {
         })
     }
 
-    /// Excludes the rest from the mask of a photograph of this size.
+    /// Masks everything else in a photograph of this size; creates the mask if there is none.
     pub fn restrict(&self, width: u32, height: u32, mask: &mut Option<Vec<u8>>) {
         let k = self.source.resized(width, height);
         let mask = mask.get_or_insert_with(|| vec![255; width as usize * height as usize]);
@@ -109,7 +109,7 @@ mod tests {
             k: [-0.3, 0.0, 0.0, 0.0, 0.0, 0.0],
             p: [0.0; 2],
         };
-        // Of r - 0.3 r^3 the largest value is 0.7027, at r = 1.0541.
+        // The maximum of r - 0.3 r^3 is 0.7027, at r = 1.0541.
         for (lens, rim, radius) in [(fisheye, Some(1.2), 1.2), (folding, None, 0.7027)] {
             let shown = Shown::of(&camera(lens), || rim).expect("corners are beyond");
             let mut mask = None;
@@ -139,7 +139,7 @@ mod tests {
         Shown::of(&panorama, || None).unwrap().restrict(200, 100, &mut mask);
         let mask = mask.unwrap();
         let kept = |row: usize, column: usize| mask[row * 200 + column] == 255;
-        // 1.8 degrees a pixel.
+        // 1.8 degrees per pixel.
         assert!(!kept(7, 100) && kept(9, 100) && kept(90, 100) && !kept(92, 100));
         assert!(!kept(50, 1) && kept(50, 3) && kept(50, 196) && !kept(50, 198));
     }

@@ -15,25 +15,25 @@ const LARGEST: f64 = 2.0;
 /// Minimum side of a crop, pixels.
 const SMALLEST: i64 = 16;
 
-/// The way from the photographs of one camera to pinhole images.
+/// The mapping from the photographs of one camera to pinhole images.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Undistortion {
     /// The camera of the photographs.
     source: Intrinsics,
     /// The camera of the results.
     pinhole: Intrinsics,
-    /// From the results' axes to the photographs'.
+    /// Rotation from the results' axes to the photographs'.
     turn: DQuat,
     interpolation: Interpolation,
 }
 
-/// How the value between pixels is found.
+/// How values between pixels are interpolated.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Interpolation {
-    /// Of two by two pixels, as COLMAP and OpenCV undistort, so that figures compare with those of others.
+    /// From 2 x 2 pixels, as COLMAP and OpenCV undistort, so that figures are comparable with those of other programs.
     Bilinear,
-    /// Of six by six pixels, by Lanczos's kernel, which keeps detail as fine as the pixels. `synth`'s room by a fisheye, held-out views by a pinhole, 3,000
-    /// steps: 39.04 dB bilinearly, 39.62 with four by four pixels (Keys 1981), 39.81 with these.
+    /// From 6 x 6 pixels with Lanczos's kernel, which keeps detail as fine as the pixels. Measured on `synth`'s room (photographs by a
+    /// fisheye, held-out views by a pinhole, 3,000 steps): 39.04 dB bilinearly, 39.62 with 4 x 4 pixels (Keys 1981), 39.81 with 6 x 6.
     Lanczos,
 }
 
@@ -63,8 +63,8 @@ impl Undistortion {
         whole.cropped(largest, |p| p.length() < reach)
     }
 
-    /// The image of a pinhole of `pinhole`'s focal lengths and principal point that is turned by `turn`, from its axes to the photographs', cropped
-    /// as by [`Undistortion::plan`] to directions of which `shows` holds.
+    /// The image of `pinhole` rotated by `turn` (from its axes to the photographs'), cropped as by [`Undistortion::plan`] to the
+    /// directions, in the photographs' axes, for which `shows` is true.
     pub fn turned(
         source: &Intrinsics,
         pinhole: Intrinsics,
@@ -86,11 +86,11 @@ impl Undistortion {
         whole.cropped(largest, |p| shows(turn * p.extend(1.0)))
     }
 
-    /// The part of `self` within `largest`, in pixels of its image, in which every pixel lies in the photograph and every point of the undistorted
-    /// plane in `shown`.
+    /// `self` cropped within `largest` (in pixels of its image) so that every pixel lies in the photograph and `shown` is true for
+    /// every point of the undistorted plane.
     ///
-    /// The rectangle is found by peeling: of a box that is certainly too large, the side with the largest fraction outside is
-    /// moved in until all four sides are inside. The valid region has no holes, so that the interior is valid, too.
+    /// The rectangle is found by peeling: starting from a box that is certainly too large, the side with the largest fraction
+    /// outside is moved in until all four sides are inside. The valid region has no holes, so the interior is valid, too.
     fn cropped(self, largest: Crop, shown: impl Fn(DVec2) -> bool) -> Option<Self> {
         let valid = |x: f64, y: f64| shown(self.pinhole.plane_of(DVec2::new(x, y))) && self.is_in_photograph(x, y);
         let mut crop = largest;
@@ -139,7 +139,7 @@ impl Undistortion {
         self.turn
     }
 
-    /// Whether the results show what is at the position `(x, y)` in the photograph, pixels.
+    /// Whether the results show the position `(x, y)` of the photograph, pixels.
     pub fn shows(&self, x: f64, y: f64) -> bool {
         let direction = self.source.lens.direction(self.source.plane_of(DVec2::new(x, y)));
         let ray = direction.map(|direction| self.turn.inverse() * direction);
@@ -150,7 +150,8 @@ impl Undistortion {
         })
     }
 
-    /// Place in the photograph of a place in the results, both as fractions of their sides; `None` where the lens has none.
+    /// Position in the photograph of a position in the results, both as fractions of the sides; `None` beyond the photograph, or
+    /// where the lens does not map the direction to a pixel.
     pub fn place_in_photograph(&self, [x, y]: [f64; 2]) -> Option<[f64; 2]> {
         let at = self.source_position(x * f64::from(self.pinhole.width), y * f64::from(self.pinhole.height))?;
         let place = [
@@ -160,31 +161,31 @@ impl Undistortion {
         place.iter().all(|at| (0.0..=1.0).contains(at)).then_some(place)
     }
 
-    /// Whether the left and the right edge of the photographs are one.
+    /// Whether the photographs wrap around, from the right edge to the left one.
     pub fn wraps(&self) -> bool {
         self.source.lens == Lens::Equirectangular
     }
 
-    /// Position in the photograph, pixels, of a position in the results; `None` where the lens has none.
+    /// Position in the photograph, pixels, of a position in the results; `None` where the lens does not map the direction to a pixel.
     fn source_position(&self, x: f64, y: f64) -> Option<DVec2> {
         let direction = self.turn * self.pinhole.plane_of(DVec2::new(x, y)).extend(1.0);
         Some(self.source.pixel_of(self.source.lens.project(direction)?))
     }
 
-    /// Whether a position in the results lies between the centres of the photograph's outermost pixels; the left and the right edge of a panorama
-    /// are one.
+    /// Whether a position in the results lies between the centres of the photograph's outermost pixels. Every position lies in a
+    /// panorama, which wraps around.
     fn is_in_photograph(&self, x: f64, y: f64) -> bool {
         let within = |at: f64, side: u32| (0.5..=f64::from(side) - 0.5).contains(&at);
         self.source_position(x, y)
             .is_some_and(|at| self.wraps() || within(at.x, self.source.width) && within(at.y, self.source.height))
     }
 
-    /// Undistorts an image of the source's size, or of a fraction of it; the result has the same fraction of the size.
+    /// Undistorts an image at the source's size or a fraction of it; the result is at the same fraction of its full size.
     pub fn apply(&self, from: &Pixels) -> Pixels {
         self.apply_to_part(from, Part::whole([from.width, from.height]))
     }
 
-    /// As [`Undistortion::apply`], of an image of which `part` is the photograph.
+    /// Like [`Undistortion::apply`], for an image of which only `part` is the photograph.
     pub fn apply_to_part(&self, from: &Pixels, part: Part) -> Pixels {
         match from.channels {
             1 => self.apply_channels::<1>(from, part),
@@ -194,7 +195,7 @@ impl Undistortion {
     }
 
     fn apply_channels<const C: usize>(&self, from: &Pixels, part: Part) -> Pixels {
-        // Pixels of the source for each of `from`, and of the whole result for each of this one; 1 at full size.
+        // Pixels of the source per pixel of `from`, and pixels of the full-size result per pixel of this one; 1 at full size.
         let per_source = [
             f64::from(self.source.width) / part.size[0],
             f64::from(self.source.height) / part.size[1],
@@ -208,7 +209,7 @@ impl Undistortion {
             f64::from(self.pinhole.width) / f64::from(width),
             f64::from(self.pinhole.height) / f64::from(height),
         ];
-        // Longitudes jump behind the camera, and all meet at the poles.
+        // Not interpolated for panoramas: longitudes jump behind the camera, and all meet at the poles.
         let wraps = self.wraps();
         let grid = if wraps { 1 } else { GRID };
         let grid_columns = width.div_ceil(grid) + 1;
@@ -217,7 +218,7 @@ impl Undistortion {
                 .map(|column| {
                     let center = [column * grid, y].map(|at| f64::from(at) + 0.5);
                     let at = self.source_position(center[0] * per_result[0], center[1] * per_result[1]);
-                    // Only of the grid beyond the result.
+                    // `None` only for points of the grid beyond the result.
                     let at = at.unwrap_or(DVec2::new(f64::from(self.source.cx), f64::from(self.source.cy)));
                     [0, 1].map(|axis| (part.start[axis] + at[axis] / per_source[axis] - 0.5) as f32)
                 })
@@ -254,8 +255,9 @@ impl Undistortion {
     }
 }
 
-/// The weighted sum of the `N` by `N` pixels around a position. `weights(t)` are those along an axis at the fraction `t` of the way between the two
-/// middle pixels. Pixels beyond the image repeat its rim, or its left and right edge are joined; with 4 channels colour is weighted by alpha.
+/// The weighted sum of the `N` x `N` pixels around a position. `weights(t)` are the weights along an axis, at the fraction `t` of the
+/// way between the two middle pixels. Pixels beyond the image repeat its border or, with `wraps`, continue at the opposite side. With
+/// 4 channels, colour is weighted by alpha.
 fn sample<const C: usize, const N: usize>(
     from: &Pixels,
     at: [f32; 2],
@@ -299,12 +301,12 @@ fn sample<const C: usize, const N: usize>(
         let scale = if color_weight > 0.0 { 1.0 / color_weight } else { 0.0 };
         sums[..3].iter_mut().for_each(|v| *v *= scale);
     }
-    // What is below 0 or above 255 saturates.
+    // Values below 0 or above 255 saturate.
     sums.map(|v| (v + 0.5) as u8)
 }
 
-/// Lanczos's kernel of three lobes at the six pixels around a position at the fraction `t` of the way between the third and the fourth, normalised to
-/// a sum of 1; from a table, since sines would take most of the time.
+/// Lanczos's kernel of three lobes at the six pixels around a position, at the fraction `t` of the way from the third to the fourth,
+/// normalised to a sum of 1. From a table, since sines would take most of the time.
 fn lanczos(t: f32) -> [f32; 6] {
     const STEPS: usize = 256;
     static TABLE: LazyLock<Vec<[f32; 6]>> = LazyLock::new(|| {

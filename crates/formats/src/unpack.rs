@@ -4,7 +4,7 @@ use crate::Malformed;
 use flate2::read::{DeflateDecoder, GzDecoder};
 use std::io::Read;
 
-/// A window of more than this is refused; it is allocated before the first byte.
+/// Maximum window of a zstd frame, bytes; the window is allocated before the first byte is decoded.
 const MAX_ZSTD_WINDOW: u64 = 128 << 20;
 
 /// A gzip stream, read front to back.
@@ -15,7 +15,7 @@ impl<'a> Gunzip<'a> {
         Self(GzDecoder::new(packed))
     }
 
-    /// The next `count` bytes, which the caller has found plausible.
+    /// The next `count` bytes; the caller has checked that `count` is plausible.
     pub fn take(&mut self, count: usize) -> Result<Vec<u8>, Malformed> {
         exactly(&mut self.0, count, "gzip")
     }
@@ -47,7 +47,7 @@ pub(crate) fn unzstd(packed: &[u8], count: usize) -> Result<Vec<u8>, Malformed> 
 }
 
 fn exactly(reader: &mut impl Read, count: usize, kind: &str) -> Result<Vec<u8>, Malformed> {
-    // Beyond the first 16 MiB memory follows what the stream holds, not what was declared.
+    // Beyond the first 16 MiB, memory grows with what the stream holds, not with what was declared.
     let mut bytes = Vec::with_capacity(count.min(16 << 20));
     let read = reader.take(count as u64).read_to_end(&mut bytes);
     read.map_err(|error| damaged(kind, &error))?;

@@ -1,8 +1,9 @@
-//! The part of XML that cameras are exported in, and metadata (XMP): elements, attributes, text. No document types, no entities beyond the five of XML.
+//! The subset of XML that camera exports and metadata (XMP) use: elements, attributes, text. No document types, and no entities
+//! beyond XML's five predefined ones.
 
 use crate::Malformed;
 
-/// Depth of elements beyond which a file is refused: it cannot be a list of cameras.
+/// Maximum nesting depth of elements; a deeper file cannot be a list of cameras.
 const DEEPEST: usize = 64;
 
 /// An element with its contents.
@@ -67,10 +68,10 @@ pub(crate) fn numbers(text: &str) -> Vec<f64> {
 /// The root element of a document.
 ///
 /// # Errors
-/// When tags do not match, or nothing is there.
+/// When tags do not match, or there is no element.
 pub fn parse_xml(bytes: &[u8]) -> Result<Element, Malformed> {
     let mut rest = crate::dataset::tokens::text(bytes)?;
-    // The innermost open element last; the first one holds the root.
+    // The open elements, the innermost last; the first one is a placeholder that holds the root.
     let mut open = vec![Element::default()];
     while let Some(at) = rest.find('<') {
         let last = open.len() - 1;
@@ -87,7 +88,7 @@ pub fn parse_xml(bytes: &[u8]) -> Result<Element, Malformed> {
             rest = after;
             continue;
         }
-        let end = end_of_tag(rest).ok_or_else(|| wrong("ends within a tag"))?;
+        let end = end_of_tag(rest).ok_or_else(|| wrong("it ends within a tag"))?;
         let tag = &rest[1..end];
         rest = &rest[end + 1..];
         if let Some(name) = tag.strip_prefix('/') {
@@ -132,7 +133,7 @@ fn push(open: &mut [Element], element: Element) {
     }
 }
 
-/// Position of the `>` that ends the tag at the start of `text`; those in quotes do not.
+/// Position of the `>` that ends the tag at the start of `text`; a quoted `>` does not end it.
 fn end_of_tag(text: &str) -> Option<usize> {
     let mut quote = None;
     for (at, byte) in text.bytes().enumerate() {
@@ -146,7 +147,7 @@ fn end_of_tag(text: &str) -> Option<usize> {
     None
 }
 
-/// An element from what is between its `<` and `>`.
+/// An element from the text between its `<` and `>`.
 fn start_tag(tag: &str) -> Result<Element, Malformed> {
     let (name, mut rest) = tag.split_at(tag.find(char::is_whitespace).unwrap_or(tag.len()));
     let mut attributes = Vec::new();

@@ -1,5 +1,5 @@
-//! Zip archives: the files of one by name, stored or deflated, and new ones whose files are stored.
-//! APPNOTE.TXT of PKWARE, sections 4.3.7, 4.3.12 and 4.3.16. Names are only names here: nothing is extracted to a path.
+//! Zip archives: reads stored or deflated files by name, and writes archives of stored files.
+//! APPNOTE.TXT of PKWARE, sections 4.3.7, 4.3.12 and 4.3.16. Names are never used as paths: nothing is extracted to disk.
 
 use crate::Malformed;
 use crate::bytes::Bytes;
@@ -13,7 +13,7 @@ use std::io::{self, Write};
 const END: &[u8] = b"PK\x05\x06";
 const END_LENGTH: usize = 22;
 const MAX_COMMENT: usize = 0xffff;
-/// Deflate shrinks nothing more than 1032-fold; a file that declares more is made to fill the memory.
+/// Maximum compression ratio of deflate; a file that declares more is designed to exhaust memory.
 const MAX_RATIO: usize = 1032;
 
 /// A file in an archive.
@@ -25,7 +25,7 @@ pub(crate) struct Entry<'a> {
 }
 
 impl<'a> Entry<'a> {
-    /// The content if it is stored as it is.
+    /// The content if it is not compressed.
     pub fn stored(&self) -> Option<&'a [u8]> {
         (!self.is_deflated).then_some(self.packed)
     }
@@ -60,7 +60,7 @@ pub(crate) fn files(archive: &[u8]) -> Result<HashMap<String, Entry<'_>>, Malfor
     let mut directory = Bytes::new(directory.ok_or_else(|| wrong("its directory is beyond its end"))?);
     let mut files = HashMap::new();
     for _ in 0..count {
-        // Signature, versions, flags; then method, time, checksum, sizes, lengths of the name and of what follows it.
+        // Signature, versions, flags; then method, time, checksum, sizes, and the lengths of name, extra field and comment.
         if directory.take(4)? != b"PK\x01\x02" {
             return Err(wrong("its directory is damaged"));
         }
@@ -77,7 +77,7 @@ pub(crate) fn files(archive: &[u8]) -> Result<HashMap<String, Entry<'_>>, Malfor
         let is_deflated = method == 8;
         if flags & 1 != 0 || !is_deflated && (method != 0 || packed != size) {
             return Err(wrong(&format!(
-                "{} is encrypted or compressed by a method that is not known",
+                "{} is encrypted or compressed by a method that is not supported",
                 shown(&name)
             )));
         }
@@ -98,12 +98,12 @@ pub(crate) fn files(archive: &[u8]) -> Result<HashMap<String, Entry<'_>>, Malfor
     Ok(files)
 }
 
-/// A name from a file, fit to be printed.
+/// A name from a file, made safe to print.
 pub(crate) fn shown(name: &str) -> String {
     name.chars().filter(|c| !c.is_control()).take(60).collect()
 }
 
-/// Writes an archive, file after file, stored. The time is zip's earliest, so that the same content gives the same bytes.
+/// Writes an archive of stored files, one after another. The time is zip's earliest, so that the same content gives the same bytes.
 pub(crate) struct Writer<'a> {
     out: &'a mut dyn Write,
     at: u64,

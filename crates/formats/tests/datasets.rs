@@ -80,7 +80,7 @@ fn distorted_photographs_stay_as_they_are_on_request() {
     );
     assert_eq!((mask[0], mask[40 * 15 + 20]), (0, 255));
 
-    // Nor are panoramas, of which poles and edges are masked.
+    // Panoramas are not cut either; their poles and edges are masked.
     let keys = r#""camera_model": "EQUIRECTANGULAR", "w": 80, "h": 40"#;
     let folder = pictures(4, 80, 40);
     fs::write(folder.path().join("transforms.json"), transforms(4, keys)).unwrap();
@@ -218,7 +218,7 @@ fn photographs_of_another_shape_than_their_cameras_are_named() {
     };
     let exchanged = told(r#""fl_x": 35, "w": 30, "h": 40"#);
     assert!(
-        exchanged.contains("4 of 4 photographs have another shape"),
+        exchanged.contains("4 of 4 photographs do not have the aspect ratio"),
         "{exchanged}"
     );
     assert!(exchanged.contains("40x30 pixels for 30x40"), "{exchanged}");
@@ -254,7 +254,7 @@ fn maps_of_depth_are_found_where_files_name_them_and_in_their_folder() {
     assert_eq!(values(plain.clone(), "transforms.json"), [None, None, Some(2.0), None]);
     let named = plain.replacen("\"file_path\"", "\"depth_file_path\": \"far.png\", \"file_path\"", 1);
     assert!(values(named.clone(), "transforms.json").iter().flatten().eq([&7.0]));
-    // Rendered scenes: the truth, to compare with.
+    // Maps of rendered scenes are ground truth for comparisons, not input.
     fs::remove_file(root.join("transforms.json")).unwrap();
     assert_eq!(values(named, "transforms_train.json"), [None; 4]);
 }
@@ -361,11 +361,8 @@ fn masks_and_maps_that_are_not_there_are_told() {
     );
     fs::write(folder.path().join("transforms.json"), with).unwrap();
     let told = read(folder.path()).unwrap().warnings.join("\n");
-    assert!(told.contains("1 masks are not there, such as m/0.png"), "{told}");
-    assert!(
-        told.contains("1 maps of depth are not there, such as d/0.png"),
-        "{told}"
-    );
+    assert!(told.contains("1 masks are missing, such as m/0.png"), "{told}");
+    assert!(told.contains("1 depth maps are missing, such as d/0.png"), "{told}");
 }
 
 #[test]

@@ -1,5 +1,5 @@
 //! Broken bytes: valid seeds of every parser, truncated and mutated a few thousand times. Nothing may panic or hang, and
-//! sizes in headers may not be allocated unchecked. The same entry points are fuzzed in `/fuzz`.
+//! sizes in headers may not be allocated unchecked. Most of these entry points are fuzzed in `/fuzz`, too.
 
 use irradia_formats::parse;
 use irradia_scene::Rng;
@@ -161,7 +161,7 @@ fn cases() -> Vec<Case> {
         case("state dict, stream", torch::stream(&TENSORS), |b| {
             parse::tensors(b).is_ok()
         }),
-        // One tag, the camera's model; what is damaged is as if it were absent.
+        // One tag, the camera's model; a damaged tag counts as absent.
         case(
             "EXIF",
             b"II\x2a\0\x08\0\0\0\x01\0\x10\x01\x02\0\x04\0\0\0One\0\0\0\0\0".into(),

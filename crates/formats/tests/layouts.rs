@@ -1,4 +1,4 @@
-//! One synthetic capture, written in every layout by conversions of their own, read back: the same cameras and rays as COLMAP's.
+//! One synthetic capture, written in every layout by conversions of the tests' own and read back: cameras and rays must equal COLMAP's.
 
 use glam::{DMat3, DQuat, DVec3, Vec2};
 use image::{GrayImage, Luma, Rgb, RgbImage};
@@ -12,7 +12,7 @@ use tempfile::TempDir;
 const WIDTH: f64 = 64.0;
 const HEIGHT: f64 = 48.0;
 const COUNT: usize = 5;
-/// Of rays and centres: results are `f32`, and files have 12 digits.
+/// Tolerance of rays and centres: results are `f32`, and files have 12 digits.
 const TOLERANCE: f32 = 1e-6;
 
 /// The capture: camera-from-world, as COLMAP has it.

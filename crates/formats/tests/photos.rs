@@ -63,7 +63,7 @@ fn a_drone_tells_where_up_is() {
     let found = read_photo_folder(folder.path()).unwrap();
     let up = found.photos[0].up.expect("known");
     assert!((up - DVec3::NEG_Z).length() < 1e-9, "{up}");
-    // Stored on its side, what the gimbal says is not known to be of the picture as it is seen.
+    // If the image is stored on its side, it is unknown whether the gimbal's angles refer to it as stored or as displayed.
     add_exif(&path, &exif_block(&[(Tag::Orientation, Value::Short(vec![6]))]));
     let found = read_photo_folder(folder.path()).unwrap();
     assert_eq!(found.photos[0].up, None);
@@ -83,7 +83,7 @@ fn two_forms_of_one_photograph_count_once() {
     // The same name at another time, and another name at the same time.
     save("2.jpeg", 12, "2026:05:31 12:00:00");
     save("2.jpg", 13, "2026:05:31 12:00:01");
-    // Nothing tells that these are one.
+    // Nothing shows that these are the same photograph.
     picture(40, 30, 14).save(folder.path().join("3.jpg")).unwrap();
     picture(40, 30, 15).save(folder.path().join("3.png")).unwrap();
     let found = read_photo_folder(folder.path()).unwrap();
@@ -179,7 +179,8 @@ fn masks_of_turned_photographs_are_turned_with_them() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
     fs::create_dir(root.join("masks")).unwrap();
-    // Stored lying, seen standing: 30 x 40. The left half of what is seen is hidden, which is the lower half of what is stored.
+    // Stored as landscape, displayed as portrait: 30 x 40. The left half of the displayed image is hidden, which is the lower half of the
+    // stored one.
     save_turned(&root.join("a.jpg"), &picture(40, 30, 9), 6);
     let half = |hides: fn(u32, u32) -> bool, width, height| {
         image::GrayImage::from_fn(width, height, |x, y| image::Luma([if hides(x, y) { 0 } else { 255 }]))
@@ -193,7 +194,7 @@ fn masks_of_turned_photographs_are_turned_with_them() {
     assert!(hidden(), "as stored");
     half(|x, _| x < 15, 30, 40).save(root.join("masks/a.png")).unwrap();
     assert!(hidden(), "as seen");
-    // Masks of other names are told.
+    // A folder of masks with other names is reported.
     fs::rename(root.join("masks/a.png"), root.join("masks/mask_a.png")).unwrap();
     let found = read_photo_folder(root).unwrap();
     assert!(found.photos[0].mask.is_none());
@@ -206,7 +207,7 @@ fn masks_of_turned_photographs_are_turned_with_them() {
 #[test]
 fn phones_photographs_are_read_with_what_the_camera_wrote() {
     let folder = tempfile::tempdir().unwrap();
-    // The turn stands in the container as well: what EXIF says must not turn the picture once more.
+    // Only the container declares the rotation (none here): EXIF orientation must not rotate the image.
     let tags = [(Tag::FocalLengthIn35mmFilm, 27), (Tag::Orientation, 6)];
     let block = exif_block(&tags.map(|(tag, value)| (tag, Value::Short(vec![value]))));
     let seen = picture(40, 30, 10);
@@ -308,7 +309,7 @@ fn photographs_are_as_read_dataset_decodes_them() {
     }
 }
 
-/// What an equirectangular camera sees of a world of patches, from directions.
+/// An equirectangular image of a world of patches, whose colours depend on the direction.
 fn panorama(width: u32) -> image::RgbImage {
     use std::f32::consts::{PI, TAU};
     let height = width / 2;
@@ -332,7 +333,7 @@ fn panoramas_are_found_and_cut_into_faces() {
     let root = folder.path();
     let round = panorama(1024);
     round.save(root.join("a.png")).unwrap();
-    // Of the same shape, but no panoramas: a crop, a small one, an object before white.
+    // Of the same aspect ratio, but not panoramas: a crop, a thumbnail, an object on white.
     image::imageops::crop_imm(&round, 100, 100, 600, 300)
         .to_image()
         .save(root.join("b.png"))
@@ -345,7 +346,7 @@ fn panoramas_are_found_and_cut_into_faces() {
         _ => image::Rgb([250; 3]),
     });
     object.save(root.join("d.png")).unwrap();
-    // Some programs miss the shape by a few pixels, and a photograph is of another one.
+    // Some programs miss the aspect ratio by a few pixels; an image that misses it by more is a photograph.
     let resized = |width: u32, name: &str| {
         let filter = image::imageops::FilterType::Triangle;
         image::imageops::resize(&round, width, 512, filter)
@@ -371,7 +372,7 @@ fn panoramas_are_found_and_cut_into_faces() {
             "a_up.jpg"
         ]
     );
-    // A face's middle looks along its axis: the front at the panorama's middle, the right a quarter further.
+    // A face's centre looks along its axis: the front at the panorama's centre, the right a quarter of a turn further.
     for (face, x) in [(&faces[2], 512), (&faces[4], 768), (&faces[3], 256)] {
         let picture = image::open(out.join("images").join(&face.name)).unwrap().into_rgb8();
         assert_eq!(
@@ -415,7 +416,7 @@ fn folders_of_one_name_are_told_apart_by_those_around_them() {
     let found = read_photo_folders(&folders).unwrap();
     let names: Vec<&str> = found.photos.iter().map(|photo| photo.name.as_str()).collect();
     assert_eq!(names, ["monday_DCIM_1.png", "spare_1.png", "tuesday_DCIM_1.png"]);
-    // The same folder by two ways.
+    // The same folder by two paths.
     let again = root.path().join("monday/../monday/DCIM");
     let found = read_photo_folders(&[folders[0].clone(), again]).unwrap();
     assert_eq!(

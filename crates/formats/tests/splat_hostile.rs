@@ -1,5 +1,5 @@
-//! Files made to deceive: lengths that lie, archives that unfold without end, numbers that are none, paths out of the folder. Each is
-//! refused with one line that says what and where.
+//! Malicious files: false lengths, decompression bombs, values that are not numbers, paths out of the folder. Each is refused with one
+//! line that says what and where.
 
 use irradia_formats::{SplatFormat, parse, read_splat_file, read_splats, write_splats};
 use irradia_scene::GaussianCloud;
@@ -99,7 +99,7 @@ fn lengths_that_lie() {
 
 #[test]
 fn archives_that_unfold_without_end() {
-    // A gzip stream of a gigabyte of zeros behind a header of three splats costs what three splats cost.
+    // A gzip stream of 64 MiB of zeros behind a header of three splats costs no more than three splats.
     let mut header = b"NGSP\x03\x00\x00\x00\x03\x00\x00\x00\x00\x0c\x00\x00".to_vec();
     header.resize(64 << 20, 0);
     assert_eq!(parse::spz(&gzip(&header)).unwrap().len(), 3);
@@ -148,7 +148,7 @@ fn scenes_of_images_with_wrong_sizes_and_indices() {
         error
     };
     assert!(edit("\"count\":3", "\"count\":99999999999").contains("99999999999 splats"));
-    assert!(edit("\"count\":3", "\"count\":200").contains("do not suit"));
+    assert!(edit("\"count\":3", "\"count\":200").contains("does not match"));
     assert!(edit("\"version\":2", "\"version\":7").contains("version 7"));
     for path in ["../../secret.webp", "/etc/passwd", "..", "c:\\secret"] {
         let escaped = path.replace('\\', "\\\\");

@@ -1,5 +1,5 @@
-//! Every splat reader against damaged files: small scenes of every format, truncated and mutated, on the outside and, unpacked and
-//! packed again, on the inside. Nothing may panic, hang or take memory for what is not there.
+//! Every splat reader against damaged files: small scenes of every format, truncated and mutated, both as they are and inside their
+//! compression, by unpacking and packing again. Nothing may panic, hang or allocate memory for content that does not exist.
 //!
 //! `IRRADIA_FUZZ_EXECUTIONS=1000000 cargo test --release -p irradia-formats --test splat_mutations` runs each reader that often,
 //! deterministically: a failure names the reader and the seed.
@@ -13,12 +13,12 @@ use std::time::{Duration, Instant};
 
 /// Executions of each reader in an ordinary test.
 const EXECUTIONS: u64 = 3000;
-/// No small file may take longer; machines that run tests are slow and busy.
+/// Maximum time for a small file; generous, since machines that run tests are slow and busy.
 const MOST: Duration = Duration::from_secs(5);
 
 type Parse = fn(&[u8]) -> bool;
 
-/// How a file's content is packed: what mutations of its inside must go through again.
+/// How a file's content is packed; mutated content must be packed again in this way.
 #[derive(Clone, Copy)]
 enum Packing {
     None,
@@ -100,7 +100,7 @@ fn scene(count: usize, sh_degree: u32) -> GaussianCloud {
     }
 }
 
-/// Files of the format whose name ends with `suffix`, as this crate writes them, and those of others.
+/// Files of the format whose name ends with `suffix`: as this crate writes them, and by other programs.
 fn seeds(suffix: &str, options: &[WriteOptions], fixtures: &[&str]) -> Vec<Vec<u8>> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join(format!("a{suffix}"));
@@ -119,7 +119,7 @@ fn seeds(suffix: &str, options: &[WriteOptions], fixtures: &[&str]) -> Vec<Vec<u
     seeds
 }
 
-/// Numbers at which arithmetic breaks, for text.
+/// Values that break arithmetic, as text.
 const WORDS: [&str; 12] = [
     "0",
     "-1",
@@ -170,7 +170,7 @@ fn mutate(bytes: &mut Vec<u8>, rng: &mut Rng) {
                 bytes[at..end].fill(if rng.below(2) == 0 { 0xFF } else { 0 });
             }
             _ => {
-                // A number of text becomes another.
+                // Replaces a number in text by another one.
                 let Some(start) = bytes[at..].iter().position(u8::is_ascii_digit).map(|i| at + i) else {
                     continue;
                 };
@@ -184,7 +184,7 @@ fn mutate(bytes: &mut Vec<u8>, rng: &mut Rng) {
     }
 }
 
-/// Runs a reader on its seeds, on all of their beginnings, and on mutations of them.
+/// Runs a reader on its seeds and on mutations of them.
 fn fuzz(reader: &str, packing: Packing, parse: Parse, seeds: &[Vec<u8>]) {
     let executions = std::env::var("IRRADIA_FUZZ_EXECUTIONS").map_or(EXECUTIONS, |count| count.parse().unwrap());
     let insides: Vec<_> = seeds.iter().map(|seed| packing.unpack(seed)).collect();
@@ -220,7 +220,7 @@ fn fuzz(reader: &str, packing: Packing, parse: Parse, seeds: &[Vec<u8>]) {
         accepted += u64::from(outcome.unwrap_or(false));
     }
     println!("{reader}: {executions} executions, {accepted} accepted, the slowest {slowest:?}");
-    // Mutations that are all refused at the door would test nothing.
+    // Mutations that are all refused at once would test nothing.
     assert!(
         accepted * 100 > executions,
         "{reader}: only {accepted} of {executions} accepted"

@@ -15,7 +15,7 @@ fn scene(count: usize, sh_degree: u32) -> GaussianCloud {
         ..GaussianCloud::default()
     };
     for i in 0..count {
-        // An x of its own, by which splats are found again in any order.
+        // A distinct x, by which splats are found again in any order.
         let x = ((i * 7919) % count) as f32 * (8.0 / count as f32) - 4.0;
         cloud.means.push([x, rng.range(-2.0, 2.0), rng.range(-1.0, 3.0)]);
         cloud.quats.push([0; 4].map(|_| rng.range(-1.0, 1.0)));
@@ -98,7 +98,7 @@ fn round_trip(name: &str, cloud: &GaussianCloud, options: WriteOptions) -> Gauss
 fn every_format_round_trips_within_its_precision() {
     let [low, normal, high] = [Quality::Low, Quality::Normal, Quality::High];
     let byte = 0.5 / 255.0 + 1e-6;
-    // Half a step of each format; harmonics of 1.0 would not be among these scenes'.
+    // Tolerances of half a step of each format; these scenes have no harmonics as large as 1.0.
     #[rustfmt::skip]
     let cases = [
         // name, quality, version, position, ln scale, opacity and colour, harmonics, rotation
@@ -114,7 +114,7 @@ fn every_format_round_trips_within_its_precision() {
         ("a.sog", high, SpzVersion::V3, 1.3e-4, 0.02, 0.003, 0.005, 0.02),
         ("a.glb", normal, SpzVersion::V3, 0.0, 1e-6, 1e-6, 0.0, 2e-3),
         ("a.gltf", normal, SpzVersion::V3, 0.0, 1e-6, 1e-6, 0.0, 2e-3),
-        // Three components of 8 bits leave the fourth in doubt where it is small.
+        // Three components of 8 bits determine the fourth poorly if it is small.
         ("a.spz.glb", high, SpzVersion::V3, 1e-6, 0.032, byte, 0.004, 0.25),
     ];
     let mut failures = Vec::new();
@@ -288,7 +288,7 @@ fn a_scene_far_from_the_origin_keeps_its_shape() {
         assert!((back.means[i][0] - 1000.0 * cloud.means[i][0]).abs() < 1e-3);
         assert!((back.log_scales[i][0] - cloud.log_scales[i][0] - 1000f32.ln()).abs() < 1e-5);
     }
-    // NumPy's arrays have no place for another coordinate system either.
+    // NumPy archives cannot hold a second coordinate system either.
     let write = |name: &str, cloud: &GaussianCloud| {
         let path = folder.path().join(name);
         let notes = write_splats_with(&path, cloud, &WriteOptions::default()).unwrap();
@@ -377,7 +377,7 @@ fn the_same_scene_in_two_formats_is_the_same() {
         "{sums:?}"
     );
 
-    // Three splats of a training run, as PLY and by two converters of it.
+    // Three splats of a training run, as PLY and as two programs converted it.
     let ply = read("fixtures_metalsplatter/test-splat.3-points-from-train.ply");
     let spz = differences(&ply, &read("fixtures_metalsplatter/test-splat.3-points-from-train.spz"));
     assert!(

@@ -105,7 +105,7 @@ fn hostile_files_are_rejected_in_one_line() {
         &with_tensor("Double", "K\u{0}", "K\u{1}", "K\u{1}"),
         "only 32-bit floats",
     );
-    // A call that would run a program in Python is a call that makes no tensor.
+    // A call that would run a program in Python is only a call that makes no tensor.
     refused(&with_pickle(b"\x80\x02cos\nsystem\n(U\x02lstR."), "state_dict()");
     // Pickles that never end, pop from an empty stack, nest, or call themselves.
     refused(&with_pickle(b"\x80\x02}"), "ends too early");
@@ -119,7 +119,7 @@ fn hostile_files_are_rejected_in_one_line() {
     refused(&with_pickle(&b"]".repeat(3 << 20)), "too many");
     let circle = with_pickle(b"\x80\x02}q\x00(U\x01ah\x00u.");
     refused(&circle, "unsupported kind");
-    // A list that is converted to a dict a million times.
+    // A list of 50,000 pairs that is converted to a dict 50,000 times.
     let mut bomb = b"\x80\x02ccollections\nOrderedDict\nq\x00](".to_vec();
     bomb.extend(b"NN\x86".repeat(50_000));
     bomb.extend(b"e\x85q\x01");

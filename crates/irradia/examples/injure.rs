@@ -1,4 +1,4 @@
-//! Writes a copy of a dataset with artificial faults, to measure what corrects them:
+//! Writes a copy of a dataset with artificial faults, to measure how well they are corrected:
 //!
 //! ```text
 //! cargo run --release --example injure -- DATA OUT --gains 0.6,1.6 --balance 0.15      # exposure and white balance per photograph
@@ -36,17 +36,17 @@ struct Args {
     /// A factor per channel and photograph, uniform between 1 - this and 1 + this
     #[arg(long, default_value_t = 0.0)]
     balance: f32,
-    /// Factors over each photograph on its sRGB colours: a gradient in a random direction, from the one to the other at its corners or
-    /// less, darkened by a vignette of random strength
+    /// Factors over each photograph on its sRGB colours: a gradient in a random direction whose values at the corners are within this
+    /// range, darkened by a vignette of random strength
     #[arg(long, value_name = "FROM,TO", value_parser = pair)]
     local_gains: Option<[f32; 2]>,
-    /// Factor at the corners of all photographs on their sRGB colours; its logarithm grows with the squared distance from the middle
+    /// Factor at the corners of all photographs on their sRGB colours; its logarithm grows with the squared distance from the centre
     #[arg(long, default_value_t = 1.0)]
     vignette: f32,
     /// Standard deviations of the poses' rotation in degrees and of their position in extents of the scene
     #[arg(long, value_name = "DEG,FRACTION", value_parser = pair)]
     pose_noise: Option<[f32; 2]>,
-    /// Share of the training photographs with a textured box the size of a person, each time elsewhere
+    /// Share of the training photographs with a textured box the size of a person, at a random position in each
     #[arg(long, default_value_t = 0.0)]
     people: f32,
     /// Random seed
@@ -108,7 +108,7 @@ struct LocalGain {
 }
 
 impl LocalGain {
-    /// A gradient between the gains `from` and `to` at most, of any direction, and a vignette down to `from` at most.
+    /// A gradient in a random direction with gains between `from` and `to`, and a vignette with a gain of at least `from`.
     fn random([from, to]: [f32; 2], rng: &mut Rng) -> Self {
         let (from, to) = (from.ln(), to.ln());
         let ends = [rng.range(from, to), rng.range(from, to)];
@@ -161,7 +161,7 @@ fn write_view(args: &Args, dataset: &Dataset, extent: f32, view: usize) -> Resul
     let source = &dataset.views[view];
     let mut photo = source.photo.load()?;
     let local = args.local_gains.map(|range| {
-        // A sequence of its own: other faults stay the same.
+        // A separate random sequence, so that the other faults stay the same.
         LocalGain::random(range, &mut Rng::new(args.seed, view as u64 | 1 << 32))
     });
     let lens = LocalGain {

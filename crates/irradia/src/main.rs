@@ -28,9 +28,9 @@ enum Command {
     Demo(command::demo::Args),
     /// Say what is wrong with photographs before they are posed: blur, exposure, gaps, ..
     Doctor(command::doctor::Args),
-    /// Find the poses of photographs, of films' frames and of panoramas
+    /// Find the poses of photographs, film frames and panoramas
     Pose(command::pose::Args),
-    /// Train a scene from photographs, or a film
+    /// Train a scene from photographs or a film
     Train(command::train::Args),
     /// Train several recipes under the same conditions and compare them
     Compare(command::compare::Args),
@@ -42,19 +42,19 @@ enum Command {
     Lpips(command::lpips::Args),
     /// Render a scene into PNG frames
     Render(command::render::Args),
-    /// Look at a scene, a run or a dataset in a browser
+    /// View a scene, a run or a dataset in a browser
     View(command::view::Args),
-    /// Write a scene as one page that opens from the disk in any browser
+    /// Write a scene as one HTML page that opens from disk in any browser
     Share(command::share::Args),
     /// Describe a scene, a run or a dataset
     Info(command::files::InfoArgs),
-    /// Convert a scene to another file format, by the end of its name, and say what it costs
+    /// Convert a scene to another file format, given by the extension of its name, and report the loss
     Convert(command::convert::ConvertArgs),
-    /// Make a scene small: fewer splats, trained to take the place of the others and to suit the file
+    /// Make a scene small: fewer splats, trained to replace the others and to lose little in the file format
     Compact(command::compact::Args),
     /// Edit a scene: select, delete, move, recolour, remove floaters, merge, ..
     Edit(command::edit::Args),
-    /// List the GPUs of this machine, by whose names --device knows them
+    /// List the GPUs of this machine, with their names for --device
     Devices,
     /// Write a ray-traced scene as a dataset: images, depth, normals, points, cameras
     Synth(command::demo::SynthArgs),

@@ -4,9 +4,9 @@
 //! cargo run --release -p irradia-runs --example floaters -- RUN..
 //! ```
 //!
-//! For each run a row: splats; held-out PSNR as trained; share of splats found in it, and the PSNR without them; PSNR with what was
-//! planted; how many of each kind are found, and the share of the scene's own; the PSNR without what was found. A last column judges
-//! without photographs.
+//! Prints a row for each run: splats; held-out PSNR as trained; share of splats found as floaters, and PSNR without them; PSNR with the
+//! planted floaters; how many of each kind are found, and the share of the scene's own splats that are lost; PSNR without what was found.
+//! The last column is for a search without photographs.
 
 use glam::{Quat, Vec2, Vec3};
 use irradia_edit::{Draft, FloaterScores, floater_scores};
@@ -21,10 +21,10 @@ use irradia_train::model::Model;
 use std::error::Error;
 use std::path::{Path, PathBuf};
 
-/// Isolated, needle, huge, unseen, in front: floaters of each.
+/// Number of floaters of each kind: isolated, needle, huge, unseen, in front.
 const EACH: usize = 100;
 const SEED: u64 = 7;
-/// What belongs to a scene in its run.
+/// The files that belong to a scene in its run.
 const BESIDE: [&str; 4] = ["run.json", "recipe.toml", "cameras.json", "world.json"];
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -102,8 +102,8 @@ fn held_out_psnr(cloud: &GaussianCloud, scene: &Scene, dataset: &Dataset) -> Res
     Ok(mean.psnr)
 }
 
-/// Adds [`EACH`] floaters of a kind: isolated balls between camera and subject; needles; splats larger than the distance of the cameras;
-/// balls outside of the scene; balls close to a camera.
+/// Adds [`EACH`] floaters of each kind: isolated balls between camera and subject; needles; splats larger than the distance of the cameras;
+/// balls outside the scene; balls close to a camera.
 fn plant(cloud: &mut GaussianCloud, cameras: &[Camera], seed: u64) {
     let mut rng = Rng::new(seed, 0);
     let focus = focus_point(cameras);
@@ -136,7 +136,7 @@ fn plant(cloud: &mut GaussianCloud, cameras: &[Camera], seed: u64) {
                     _ => (from_eye(0.03, 0.15), [rng.range(0.002, 0.01); 3]),
                 };
                 let sizes = sizes.map(|size| size * distance);
-                // In the air, not in a surface.
+                // In empty space, not in a surface.
                 let clear = |surface: &[f32; 3]| mean.distance(Vec3::from(*surface)) > 5.0 * sizes[0];
                 if kind != 0 || surfaces.iter().all(clear) {
                     break (mean, sizes);

@@ -8,30 +8,31 @@ use serde::{Deserialize, Serialize};
 use std::fmt::{self, Display, Formatter};
 use std::str::FromStr;
 
-/// Photographs that are asked about their border, and their longer side, pixels.
+/// Number of photographs that are examined, and their longer side, pixels.
 const SAMPLES: usize = 8;
 const SIDE: f32 = 400.0;
-/// Share of a photograph's outermost pixels that are white if its object is cut out: it may touch the border.
+/// Minimum share of white pixels at the border of a photograph whose object is cut out; the object may touch the border.
 const BORDER_SHARE: f64 = 0.9;
-/// Least value of a white pixel: compression leaves some noise.
+/// Minimum value of a white pixel: compression leaves some noise.
 const WHITE: u8 = 250;
-/// Least value of the channels of a white backdrop, which has shades and a tint, and largest of those of a black one, which is brightened by a flash. Floors
-/// and tables between them are surfaces.
+/// Minimum channel value of a white backdrop, which may be shaded and tinted, and maximum channel value of a black one, which a flash may
+/// brighten. Anything in between, such as floors and tables, counts as a surface.
 const WHITE_BACKDROP: u8 = 224;
 const BLACK_BACKDROP: u8 = 64;
-/// Largest difference of a backdrop's pixels from its colour, in each channel: cloth and paper have folds and shades.
+/// Maximum difference of a backdrop's pixels from its colour, in each channel: cloth and paper have folds and shading.
 const SHADE: u8 = 24;
-/// Share of the outermost pixels that show the backdrop: in the mean of the photographs, and in each.
+/// Minimum share of border pixels that show the backdrop: averaged over the photographs, and in each.
 const BACKDROP_SHARES: [f64; 2] = [0.8, 0.5];
-/// Pixels beside what a mask leaves out that show what is behind the object, if masks are generous.
+/// Width of a mask's rim, pixels: near the edge of a generous mask, kept pixels still show what is behind the object.
 const RIM: usize = 3;
-/// Share of the outermost pixels that masks leave out if they leave out what is around an object, and of the pixels at their rim that have the backdrop's colour,
-/// in the mean of the photographs. Measured: 0.79 and 0.98 for a medal before dark blue, 0.99 and 0.63 for a plush dog before paper, 0.97 and 0.2 for a box cut
-/// out along its outlines; masks of people and of what holds the camera leave out less of the border, and their rim shows the scene.
+/// Minimum share of border pixels that masks exclude if they exclude the surroundings of an object, and minimum share of rim pixels that
+/// have the backdrop's colour, both averaged over the photographs. Measured: 0.79 and 0.98 for a medal in front of dark blue, 0.99 and
+/// 0.63 for a plush dog in front of paper, 0.97 and 0.2 for a box cut out along its outlines; masks of people and of whatever holds the
+/// camera exclude less of the border, and their rim shows the scene.
 const LEFT_OUT: f64 = 0.6;
 const RIM_SHARE: f64 = 0.5;
 
-/// Colours of pixels of a photograph beside which nothing is known: the outermost ones, or those at the rim of what its mask leaves out.
+/// Colours of pixels at the edge of the known part of a photograph: at its border, or at the rim of its mask.
 type Border = Vec<[u8; 3]>;
 
 fn colors(photo: &Photo, at: impl Iterator<Item = usize>) -> Border {
@@ -44,7 +45,7 @@ fn border(photo: &Photo) -> Border {
     colors(photo, photo.border())
 }
 
-/// The pixels that `mask` keeps at the rim of what it leaves out, or leaves out at the rim of what it keeps.
+/// The rim pixels of `mask`: those on its kept side if `keeps`, otherwise those on its excluded side.
 fn rim(photo: &Photo, mask: &[u8], keeps: bool) -> Border {
     let (width, height) = (photo.width as usize, photo.height as usize);
     let around = |at: usize, end: usize| at.saturating_sub(RIM)..(at + RIM + 1).min(end);
@@ -57,12 +58,12 @@ fn rim(photo: &Photo, mask: &[u8], keeps: bool) -> Border {
     colors(photo, (0..width * height).filter(is_rim))
 }
 
-/// The pixels that `mask` leaves out.
+/// The pixels that `mask` excludes.
 fn outside(photo: &Photo, mask: &[u8]) -> Border {
     colors(photo, (0..mask.len()).filter(|at| mask[*at] == 0))
 }
 
-/// The share of the pixels that `holds`.
+/// The share of the pixels for which `holds` is true.
 fn share(border: &Border, holds: impl Fn([u8; 3]) -> bool) -> f64 {
     border.iter().filter(|color| holds(**color)).count() as f64 / border.len().max(1) as f64
 }
@@ -81,22 +82,23 @@ fn median(colors: &[[u8; 3]]) -> [u8; 3] {
     })
 }
 
-/// The colour that most of `borders` have.
+/// The typical colour of `borders`: the median of their medians.
 fn common(borders: &[Border]) -> [u8; 3] {
     let medians: Vec<[u8; 3]> = borders.iter().map(|border| median(border)).collect();
     median(&medians)
 }
 
-/// The share of each of `borders` that is near `color`.
+/// For each of `borders`, the share of its pixels that are near `color`.
 fn shares_near(borders: &[Border], color: [u8; 3]) -> Vec<f64> {
     let is_near = |other: [u8; 3]| other.iter().zip(color).all(|(a, b)| a.abs_diff(b) <= SHADE);
     borders.iter().map(|border| share(border, is_near)).collect()
 }
 
-/// The colour behind the object that masks leave all out but for a rim, if it has one: no splats are needed to show it there. Held-out PSNR, pixels not masked,
-/// 480 pixels, 60 s, over grey and over the rim's colour: medal 18.3, 23.4 dB; dog 29.7, 30.9. The rim has the object's shadow; what masks leave out is the backdrop itself where
-/// it goes on beyond the rim. With the colour of the rim and with that, 1,500 steps: dog 30.26, 30.81 dB; medal 24.32, 24.97; a temple, part of whose rim is cloth before black,
-/// 2,000 steps, 32.12, 36.41.
+/// The colour of the backdrop behind an object, of which masks keep only a rim, if it has a single colour: splats then need not represent
+/// it. Held-out PSNR of unmasked pixels, 480 pixels, 60 s, over grey and over the rim's colour: medal 18.3, 23.4 dB; dog 29.7, 30.9. The
+/// rim contains the object's shadow, whereas the excluded pixels show the backdrop itself if it continues beyond the rim. With the rim's
+/// colour and with that of the excluded pixels, 1,500 steps: dog 30.26, 30.81 dB; medal 24.32, 24.97; a temple, part of whose rim is
+/// cloth in front of black, 2,000 steps: 32.12, 36.41.
 fn masked_backdrop(photos: &[Photo]) -> Option<[u8; 3]> {
     let left_out = photos.iter().map(Photo::border_left_out).sum::<f64>() / photos.len() as f64;
     if left_out < LEFT_OUT {
@@ -142,7 +144,7 @@ pub enum Background {
     White,
     /// Black in training and evaluation.
     Black,
-    /// Grey in training and evaluation, and the surfaces in front cover it: what is left to see of it matters least.
+    /// Grey in training and evaluation, and trained surfaces cover it: grey does least harm where it still shows.
     Grey,
     /// A random colour per training step, white in evaluation.
     Random,
@@ -161,8 +163,8 @@ impl Background {
         }
     }
 
-    /// Sets this background in `recipe`. Where the recipe already trains over random colours, it still does. Before one that photographs
-    /// show, surfaces need not cover it.
+    /// Sets this background in `recipe`. A recipe that already trains over random colours still does. Surfaces need not cover a background
+    /// that the photographs show.
     pub(crate) fn apply_to(self, recipe: &mut Recipe) {
         recipe.render.background = self.color();
         if self != Self::Grey {
@@ -174,10 +176,13 @@ impl Background {
         }
     }
 
-    /// The default for a dataset: white for Blender scenes with transparent photographs, judged by the first one, and for
-    /// photographs without alpha of objects cut out on white, judged by eight of them; the colour of the backdrop where photographs without alpha
-    /// have one around their object, or at the rim of what their masks leave out; grey for others without alpha if the recipe wants surfaces to
-    /// cover it (`covers`); otherwise the recipe's own.
+    /// The default for a dataset:
+    ///
+    /// - white for Blender scenes with transparent photographs, judged by the first one;
+    /// - white for photographs without alpha of objects cut out on white, judged by about eight of them;
+    /// - the colour of the backdrop if photographs without alpha have one around their object, or at the rim of their masks;
+    /// - grey for others without alpha if the recipe wants surfaces to cover it (`covers`);
+    /// - otherwise the recipe's own (`None`).
     ///
     /// # Errors
     /// When one of these photographs cannot be read.
@@ -204,7 +209,7 @@ impl Background {
         if borders.iter().all(is_white) {
             return Ok(Some(Self::White));
         }
-        // The mask of a wide lens is that of its image circle.
+        // The mask of a wide lens only excludes what is outside its image circle.
         let is_wide = |view: &usize| dataset.views[*view].camera.intrinsics.lens.is_wide();
         let backdrop = if photos.iter().all(|photo| photo.mask.is_none()) {
             backdrop(&borders)
@@ -383,7 +388,7 @@ mod tests {
         assert_eq!(usual(&uniform(25), 3, true), Some(Background::Color([25; 3])));
         assert_eq!(usual(&uniform(90), 4, true), None, "alpha shows what is empty");
 
-        // An object of 3 x 3 pixels, its backdrop, and masks of all but both, of all but the object, of a corner.
+        // An object of 3 x 3 pixels, its backdrop, and masks that keep both, only the object, or all but a corner.
         let is_object = |at: usize| [at % 8, at / 8].iter().all(|i| (2..5).contains(i));
         let object = |i: usize| {
             if is_object(i / 3) {
@@ -398,7 +403,7 @@ mod tests {
         };
         let inside = |at: usize| [at % 8, at / 8].iter().all(|i| (1..7).contains(i));
         assert_eq!(masked(&inside), Some(Background::Color([140; 3])));
-        // The object's shadow at the rim, and black painted over what a mask leaves out.
+        // The object's shadow at the rim, and black painted over what a mask excludes.
         let at_rim = |rim: u8, outside: u8| {
             let value = move |i: usize| if inside(i / 3) { rim } else { outside };
             let mask = (0..64).map(|at| if inside(at) { 255 } else { 0 }).collect();

@@ -1,9 +1,9 @@
-//! A scene from one splat format to another, and what it cost: bytes, splats and, for lossy formats, PSNR.
+//! Conversion of a scene from one splat format to another, and its cost: bytes, splats and, for lossy formats, PSNR.
 
 use crate::folder::cameras_beside;
 use crate::levels::write_scene;
 use crate::orbit::orbit;
-use crate::{RunError, scene_of};
+use crate::{RunError, check_kept, scene_of};
 use irradia_formats::{SplatFormat, WriteOptions, read_splat_file, read_splats, splat_file_size};
 use irradia_measure::psnr;
 use irradia_scene::{GaussianCloud, Similarity};
@@ -11,24 +11,24 @@ use irradia_splat::{RenderOptions, Renderer, Splats};
 use irradia_train::model::Model;
 use std::path::Path;
 
-/// Cameras around the scene from which it is compared.
+/// Number of views around the scene in which it is compared.
 pub const COMPARED_VIEWS: u32 = 12;
-/// Pixels of a compared picture.
+/// Width and height of a compared render, pixels.
 const COMPARED_SIZE: (u32, u32) = (640, 480);
 
-/// What a conversion did.
+/// The result of a conversion.
 #[derive(Clone, Debug)]
 pub struct Conversion {
     /// Formats of input and output.
     pub formats: [SplatFormat; 2],
     /// Bytes of input and output.
     pub bytes: [u64; 2],
-    /// Splats that were written.
+    /// Number of splats that were written.
     pub splats: usize,
     /// What was left out, and what the format cannot hold, a line each.
     pub notes: Vec<String>,
-    /// PSNR of the pictures of the output against those of the input, one a view, dB; infinite where they are equal. `None` for
-    /// lossless formats, for those that are not splats any more, and if it was not asked for.
+    /// PSNR between renders of the output and of the input, one per view, dB; infinite if they are equal. `None` for lossless formats, for
+    /// formats that cannot be read back as splats, and if not requested.
     pub psnr: Option<Vec<f64>>,
 }
 
@@ -36,10 +36,11 @@ pub struct Conversion {
 /// are rendered from [`COMPARED_VIEWS`] views around the scene.
 ///
 /// # Errors
-/// When a format is unknown, the input cannot be read, or the output cannot be written, in which case nothing is left of it.
+/// When a format is unknown, the output is the input, the input cannot be read, or the output cannot be written, in which case no partial file remains.
 pub fn convert(input: &Path, output: &Path, options: &WriteOptions, compares: bool) -> Result<Conversion, RunError> {
     // Reading may take a while: an unknown output format is reported first.
     let to = SplatFormat::of(output)?;
+    check_kept(input, output)?;
     let input = scene_of(input);
     let file = read_splat_file(&input)?;
     let before = splat_file_size(&input)?;
@@ -55,10 +56,10 @@ pub fn convert(input: &Path, output: &Path, options: &WriteOptions, compares: bo
     })
 }
 
-/// `cloud`, read from a file that may hold no world, in the world of `world_from_dataset`, in which it was written.
+/// `cloud`, read from a file that may not record its world, in the world of `world_from_dataset`, in which it was written.
 pub(crate) fn in_world(mut cloud: GaussianCloud, world_from_dataset: &Similarity) -> GaussianCloud {
     if cloud.world_from_dataset != *world_from_dataset {
-        // The file has the dataset's unit, about the origin of the world.
+        // The file has the dataset's unit and the world's origin.
         cloud.world_from_dataset = Similarity {
             scale: 1.0,
             center: world_from_dataset.center,
@@ -68,11 +69,11 @@ pub(crate) fn in_world(mut cloud: GaussianCloud, world_from_dataset: &Similarity
     cloud
 }
 
-/// PSNR of each view around the scene.
+/// PSNR of the output against the scene `before`, for each view around it.
 fn compare(input: &Path, before: &GaussianCloud, output: &Path) -> Result<Vec<f64>, RunError> {
     let world = before.world_from_dataset;
     let after = in_world(read_splats(output)?, &world);
-    // The flag itself is no part of the comparison: where a format loses it, a note says so.
+    // Both are rendered with the input's flag: if a format loses it, a note says so.
     let options = RenderOptions {
         antialias: before.antialiased,
         ..RenderOptions::default()

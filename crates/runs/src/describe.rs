@@ -11,7 +11,7 @@ use std::path::Path;
 /// A summary of the scene, run, dataset or point cloud at `path`.
 ///
 /// # Errors
-/// When it does not exist, cannot be read, is none of these, or is a run whose scene is not written yet.
+/// When it does not exist, cannot be read, is none of these, or is a run whose scene has not been written yet.
 pub fn describe(path: impl AsRef<Path>) -> Result<Description, RunError> {
     let scene = scene_of(path.as_ref());
     if is_field(&scene) {
@@ -30,7 +30,7 @@ pub fn describe(path: impl AsRef<Path>) -> Result<Description, RunError> {
     Ok(description)
 }
 
-/// A summary of `field`, whose file has `bytes`.
+/// A summary of `field`, whose file has a size of `bytes`.
 fn describe_field(field: &Field, bytes: u64) -> Description {
     let config = &field.config;
     let net = &config.net;

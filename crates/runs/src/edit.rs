@@ -1,4 +1,4 @@
-//! Edits of a scene on disk: read, replay a list, write.
+//! Edits of a scene on disk: read the scene, apply a list of edits, write the result.
 
 use crate::folder::{SKY, VIGNETTE, cameras_beside, cameras_moved};
 use crate::levels::write_scene;
@@ -35,16 +35,16 @@ pub struct Editing {
 /// An edit that was made.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Made {
-    /// The edit, with everything that was found automatically written out.
+    /// The edit, with all automatically determined values written out.
     pub edit: Edit,
-    /// Splats that were selected, and that there were.
+    /// Number of selected splats, and of all splats before the edit.
     pub selected: [usize; 2],
-    /// Splats after it.
+    /// Number of splats after the edit.
     pub splats: usize,
 }
 
 impl Editing {
-    /// Reads a scene; the cameras beside it are known to the edits.
+    /// Reads a scene; edits may use the cameras beside it.
     ///
     /// # Errors
     /// When it cannot be read, or is a field.
@@ -75,7 +75,7 @@ impl Editing {
         &self.draft
     }
 
-    /// The edits made, with everything that was found automatically written out.
+    /// The edits made, with all automatically determined values written out.
     pub fn list(&self) -> &EditList {
         &self.list
     }
@@ -85,10 +85,10 @@ impl Editing {
         &self.made
     }
 
-    /// Makes edits in their order. Scenes to merge are found from the current folder, or else beside this one.
+    /// Applies edits in order. Scenes to merge are looked up in the current folder, then beside this scene.
     ///
     /// # Errors
-    /// When one is not possible; those before it have been made.
+    /// When an edit is not possible; the edits before it have been applied.
     pub fn apply(&mut self, list: &EditList) -> Result<(), RunError> {
         list.check()?;
         for edit in &list.edits {
@@ -115,15 +115,15 @@ impl Editing {
     }
 
     /// Writes the scene without hidden splats: to a file, whose name selects the format, or to a folder, which gets `scene.ply`, the
-    /// cameras, the recipe, by which it is rendered, and `edits.toml`. Scenes that were split off are written beside it. Returns what the reader should
-    /// know, a line each.
+    /// cameras, the recipe (for rendering) and `edits.toml`. Scenes that were split off are written beside it. Returns notes for the user,
+    /// a line each.
     ///
     /// # Errors
     /// When the format is unknown, the output is a run or would replace the input, or a file cannot be written.
     pub fn write(&self, output: &Path, options: &WriteOptions) -> Result<Vec<String>, RunError> {
         let is_file = SplatFormat::of(output).is_ok();
         if !is_file && output.extension().is_some() && !output.is_dir() {
-            // The known endings.
+            // The error lists the known extensions.
             SplatFormat::of(output)?;
         }
         let file = match is_file {
@@ -141,7 +141,7 @@ impl Editing {
             fs::create_dir_all(output).map_err(RunError::io("create", output))?;
             let folder = RunFolder::at(output);
             let cameras = ("cameras.json", cameras_moved(&self.path, &self.moved));
-            // By these it is rendered.
+            // Rendering needs these.
             let others =
                 ["recipe.toml", SKY, VIGNETTE].map(|name| (name, fs::read(self.path.with_file_name(name)).ok()));
             for (name, content) in iter::once(cameras).chain(others) {
@@ -157,7 +157,7 @@ impl Editing {
             folder.write(EDITS, self.list.to_toml().as_bytes())?;
             if self.path.with_file_name(crate::RESIDUAL).is_file() {
                 notes.push(format!(
-                    "{} is left out: it belongs to the scene as it was",
+                    "{} is left out: it belongs to the scene before the edit",
                     crate::RESIDUAL
                 ));
             }
@@ -174,12 +174,13 @@ impl Editing {
         Ok(notes)
     }
 
-    /// Writes the edited scene over that of its run, and its edits behind those of its `edits.toml`. The latest checkpoint is edited alike:
-    /// what did not change keeps its moments, and the run resumes with the edited splats. Returns what the reader should know, a line each.
+    /// Overwrites the scene of its run with the edited one, and appends the edits to the run's `edits.toml`. The latest checkpoint is
+    /// edited in the same way: unchanged splats keep their moments, and the run resumes with the edited splats. Returns notes for the user,
+    /// a line each.
     ///
     /// # Errors
-    /// When the scene is not that of a run, the whole scene was moved away from its photographs, the run is training, a file of the name of a
-    /// split exists, or a file cannot be written.
+    /// When the scene is not a run's, the whole scene was moved away from its photographs, the run is training, the file of a split already
+    /// exists, or a file cannot be written.
     pub fn write_in_place(&self) -> Result<Vec<String>, RunError> {
         let refused = |message: String| Err(RunError::Refused(message));
         let folder = match RunFolder::containing(&self.path) {
@@ -204,7 +205,7 @@ impl Editing {
         };
         list.edits.extend(self.list.edits.iter().cloned());
         let splits = self.split_files(&self.path)?;
-        // The run no longer has what an earlier edit split off.
+        // An existing file may be the only copy of what an earlier edit split off.
         if let Some((path, _)) = splits.iter().find(|(path, _)| path.exists()) {
             return refused(format!("split: {} exists already; choose another name", path.display()));
         }
@@ -219,11 +220,11 @@ impl Editing {
         }
         notes.extend(write_scene(&self.path, &self.draft.shown(), &WriteOptions::default())?);
         folder.write(EDITS, list.to_toml().as_bytes())?;
-        notes.push("the figures of the run are those before the edit: irradia eval measures again".to_owned());
+        notes.push("the run's figures are from before the edit: run irradia eval to measure again".to_owned());
         Ok(notes)
     }
 
-    /// Makes the edits on a checkpoint. Returns the number of splats that keep their moments.
+    /// Applies the edits to a checkpoint. Returns the number of splats that keep their moments.
     fn edit_checkpoint(&self, path: &Path) -> Result<usize, RunError> {
         let failed = |source| RunError::File {
             path: path.to_owned(),
@@ -235,7 +236,7 @@ impl Editing {
         cloud.antialiased = self.draft.cloud.antialiased;
         cloud.world_from_dataset = self.draft.cloud.world_from_dataset;
         let mut draft = Draft::new(cloud, self.draft.cameras.clone());
-        // What photographs decide about the scene they decide here.
+        // Edits that depend on photographs decide as they did on the scene.
         draft.photographs = self.draft.photographs.clone();
         let mut total = Provenance::identity(draft.len());
         for edit in &self.list.edits {
@@ -251,7 +252,10 @@ impl Editing {
         Ok(sources.iter().flatten().count())
     }
 
-    /// The scenes that are split off and their files, beside `file`; each has a name of its own.
+    /// The scenes that were split off and their files, beside `file`.
+    ///
+    /// # Errors
+    /// When two of them, or one and the scene itself, would have the same file.
     fn split_files(&self, file: &Path) -> Result<Vec<(PathBuf, &GaussianCloud)>, RunError> {
         let mut files: Vec<(PathBuf, &GaussianCloud)> = Vec::new();
         for (name, cloud) in &self.splits {
@@ -276,10 +280,10 @@ impl Editing {
         Ok(files)
     }
 
-    /// Writes `before.png` and `after.png` to a folder: the scene around which a camera looks, as it was and as it is.
+    /// Writes `before.png` and `after.png` to a folder: renders of the scene before and after the edits, by one camera of its orbit.
     ///
     /// # Errors
-    /// When the scene cannot be read again or a picture cannot be written.
+    /// When the scene cannot be read again or an image cannot be written.
     pub fn write_pictures(&self, folder: &Path) -> Result<(), RunError> {
         fs::create_dir_all(folder).map_err(RunError::io("create", folder))?;
         let before = Scene::read(&self.path)?;
@@ -295,14 +299,14 @@ impl Editing {
         let after = Scene::of_draft(&self.draft, options);
         let camera = match self.moved.is_identity() {
             true => camera,
-            // The camera that moved along.
+            // The same camera, moved with the scene.
             false => after.orbit(1, Some(size))[0],
         };
         write_image(folder.join("after.png"), &after.render(&camera).color)
     }
 }
 
-/// The scene `file`, from the current folder or else beside the scene `path`.
+/// The scene `file`, looked up in the current folder, then beside the scene `path`.
 fn open_scene(file: &str, path: &Path) -> Result<GaussianCloud, String> {
     let here = Path::new(file);
     let path = match here.exists() {

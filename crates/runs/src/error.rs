@@ -43,7 +43,7 @@ pub enum RunError {
         source: TrainError,
     },
     /// A residual field was given as a scene.
-    #[error("{} only adds to splats: name the scene.ply beside it", _0.display())]
+    #[error("{} is a residual field, which only adds to splats: name the scene.ply beside it", _0.display())]
     Residual(PathBuf),
     /// The operating system reported an error.
     #[error("cannot {action} {}: {source}", path.display())]
@@ -65,7 +65,8 @@ pub enum RunError {
     },
     /// A folder contains no run.
     #[error(
-        "{0} holds no run to resume: cannot read {0}/run.json: {source}; one that was stopped before its training goes on by the command that began it",
+        "{0} holds no run to resume: cannot read {0}/run.json: {source}; if the run was stopped before training began, repeat the \
+         command that began it",
         path.display()
     )]
     NoRun {

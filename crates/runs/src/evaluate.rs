@@ -8,8 +8,8 @@ use irradia_train::model::Model;
 use std::collections::HashSet;
 use std::ops::ControlFlow;
 
-/// Renders `model` from the views `indices` of `dataset` and evaluates each with `options`. Every view is passed to `see` when it
-/// is done; returns the mean over the measured views, NaN if there are none.
+/// Renders `model` from the views `indices` of `dataset` and evaluates each with `options`. Passes every view to `see` once it is
+/// evaluated; returns the mean over the measured views, NaN if there are none.
 ///
 /// # Errors
 /// When a photograph cannot be read; the error of `see`, which ends the evaluation.
@@ -36,7 +36,7 @@ pub fn evaluate<E: From<RunError>>(
     Ok(mean(&metrics))
 }
 
-/// The views that are not measured, given names and whether they were measured: one line.
+/// One line about the views that are not measured, given the names of all views and whether each was measured; `None` if all were.
 pub fn unmeasured<'a>(views: impl Iterator<Item = (&'a str, bool)>) -> Option<String> {
     let (mut all, mut blank) = (0, Vec::new());
     for (name, measured) in views {
@@ -59,7 +59,7 @@ pub fn file_stems<'a>(names: impl Iterator<Item = &'a str>) -> Vec<String> {
     distinct(names.map(file_stem))
 }
 
-/// The names, with a number added to duplicates; names that differ only in case are equal to some file systems.
+/// The names, with a number added to duplicates. Names that differ only in case are duplicates, since some file systems ignore case.
 pub fn distinct(names: impl Iterator<Item = String>) -> Vec<String> {
     let mut taken: HashSet<String> = HashSet::new();
     let free = |name: String| {

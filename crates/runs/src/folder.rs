@@ -70,11 +70,11 @@ const FILES: [&str; 23] = [
 /// The subfolders of a run.
 const FOLDERS: [&str; 2] = ["eval", "checkpoints"];
 
-/// Files written before `run.json`, with which a run has begun.
+/// Files written before `run.json`; a run has begun once `run.json` exists.
 const EARLY: [&str; 4] = ["recipe.toml", "cameras.json", VIEWS, WORLD];
 
-/// Whether the folder `path` contains a run, or may contain one; not if it contains only the files of a process that died
-/// before its run had begun.
+/// Whether the folder `path` contains a run, or may contain one. False if it contains only files of a process that died before
+/// its run had begun.
 pub(crate) fn holds_run(path: &Path) -> bool {
     let is_early = |file: &&str| EARLY.contains(file) && FolderLock::was_taken(path);
     FILES.iter().any(|file| path.join(file).exists() && !is_early(file))
@@ -110,7 +110,7 @@ struct CameraRecord {
     rotation: [f32; 4],
 }
 
-/// `world.json`, in which `world = scale (dataset - center)`.
+/// `world.json`: `world = scale (dataset - center)`.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 struct WorldRecord {
     scale: f64,
@@ -153,7 +153,7 @@ impl RunFolder {
     /// Creates and locks the folder of a new run; removes the files of an earlier run.
     ///
     /// # Errors
-    /// When it cannot be created or cleared, is in use, or meanwhile contains a run that must not be replaced.
+    /// When it cannot be created or cleared, is in use, or by now contains a run that must not be replaced.
     pub(crate) fn create(
         path: &Path,
         overwrite: bool,
@@ -195,7 +195,7 @@ impl RunFolder {
     /// Opens the folder of an earlier run.
     ///
     /// # Errors
-    /// When there is none.
+    /// When there is no run, or its `run.json` is damaged.
     pub fn open(path: &Path) -> Result<(Self, RunRecord), RunError> {
         let file = path.join("run.json");
         let text = fs::read_to_string(&file).map_err(|source| RunError::NoRun {
@@ -226,7 +226,7 @@ impl RunFolder {
         Some(unit.metres_per_unit).filter(|metres| metres.is_finite() && *metres > 0.0)
     }
 
-    /// Keeps the metres per world unit beside the scene.
+    /// Stores the metres per world unit beside the scene.
     ///
     /// # Errors
     /// When the file cannot be written, or `metres` is not a positive number.
@@ -269,7 +269,7 @@ impl RunFolder {
     /// The recorded paces of the run's steps.
     ///
     /// # Errors
-    /// When the run has none, or the file is damaged.
+    /// When the run has no recorded paces, or the file is damaged.
     pub(crate) fn paces(&self) -> Result<Paces, RunError> {
         let path = self.file(PACES);
         let text = fs::read_to_string(&path).map_err(RunError::io("read", &path))?;
@@ -295,7 +295,7 @@ impl RunFolder {
         &self.0
     }
 
-    /// The path of a file in it.
+    /// The path of a file in the folder.
     pub fn file(&self, name: &str) -> PathBuf {
         self.0.join(name)
     }
@@ -313,7 +313,7 @@ impl RunFolder {
         self.write("run.json", &bytes)
     }
 
-    /// Writes `cameras.json`: the training views' cameras, with their refinement.
+    /// Writes `cameras.json`: the training views' cameras, with refined poses.
     pub(crate) fn write_cameras(&self, trainer: &Trainer) -> Result<(), RunError> {
         let dataset = &trainer.dataset;
         let world = dataset.world_from_dataset;
@@ -393,7 +393,7 @@ impl RunFolder {
     fn checkpoints(&self) -> Result<Vec<(u64, PathBuf)>, RunError> {
         let folder = self.file("checkpoints");
         let entries = match fs::read_dir(&folder) {
-            // A finished run from which they were deleted.
+            // A finished run whose checkpoints were deleted.
             Err(error) if error.kind() == ErrorKind::NotFound => return Ok(Vec::new()),
             entries => entries.map_err(RunError::io("read", &folder))?,
         };
@@ -431,12 +431,12 @@ pub(crate) fn to_json(value: &impl Serialize) -> Vec<u8> {
     serde_json::to_vec_pretty(value).expect("plain data")
 }
 
-/// The world of the run that contains the file `scene`; the dataset's own coordinates if there is none.
+/// The world of the run that contains the file `scene`; the dataset's own coordinates if there is no run.
 pub(crate) fn world_beside(scene: &Path) -> Result<Similarity, RunError> {
     RunFolder(scene.parent().unwrap_or(Path::new("")).to_owned()).world_from_dataset()
 }
 
-/// The cameras, in the world of `world_from_dataset`, of the run that contains the file `scene`, if there is one.
+/// The cameras of the run that contains the file `scene`, if there is one, in the world of `world_from_dataset`.
 pub(crate) fn cameras_beside(scene: &Path, world_from_dataset: &Similarity) -> Option<Vec<Camera>> {
     let text = fs::read_to_string(scene.parent()?.join("cameras.json")).ok()?;
     let records: Vec<CameraRecord> = serde_json::from_str(&text).ok()?;
@@ -462,7 +462,7 @@ pub(crate) fn camera_names_beside(scene: &Path) -> Option<Vec<String>> {
     Some(records.into_iter().map(|record| record.name).collect())
 }
 
-/// The content of `cameras.json` beside the file `scene`, if there is one, after a move of the whole scene in the dataset's coordinates.
+/// The content of `cameras.json` beside the file `scene`, if there is one, after moving the whole scene in the dataset's coordinates.
 pub(crate) fn cameras_moved(scene: &Path, moved: &Transform) -> Option<Vec<u8>> {
     let text = fs::read(scene.with_file_name("cameras.json")).ok()?;
     if moved.is_identity() {

@@ -15,13 +15,13 @@ use std::path::Path;
 /// Approximate number of points of a curve: more would not be visible.
 const CURVE_POINTS: u64 = 1000;
 
-/// Writes the files of a run as an observer.
+/// An observer that writes the files of a run.
 pub struct Journal {
     folder: RunFolder,
     events: File,
     /// Loss, PSNR and number of splats over the run.
     pub curve: Vec<CurvePoint>,
-    /// Stages entered.
+    /// The stages entered so far.
     pub stages: Vec<StageReport>,
     /// Warnings for the report.
     pub warnings: Vec<String>,
@@ -43,7 +43,7 @@ fn appended(path: &Path) -> Result<File, RunError> {
     file.map_err(RunError::io("write", path))
 }
 
-/// `pace.txt`, opened for appending after step `from`: later lines of an interrupted run are removed.
+/// `pace.txt`, opened for appending after step `from`; later lines of an interrupted run are removed.
 fn kept_paces(folder: &RunFolder, from: u64) -> Result<File, RunError> {
     let path = folder.file(PACES);
     let text = fs::read_to_string(&path).unwrap_or_default();
@@ -59,7 +59,7 @@ fn kept_paces(folder: &RunFolder, from: u64) -> Result<File, RunError> {
 }
 
 impl Journal {
-    /// Begins, or resumes after step `from`: later events of an interrupted run are removed.
+    /// Begins a journal, or resumes one after step `from`, in which case later events of an interrupted run are removed.
     pub fn open(folder: &RunFolder, from: u64) -> Result<Self, RunError> {
         let path = folder.file("events.jsonl");
         let mut journal = Self {
@@ -90,7 +90,8 @@ impl Journal {
             kept.push_str(line);
             kept.push('\n');
         }
-        if kept.len() < text.len() {
+        // The last line may also have lost its end only, and the next event would continue it.
+        if kept != text {
             folder.write("events.jsonl", kept.as_bytes())?;
             journal.events = appended(&path)?;
         }
@@ -178,7 +179,7 @@ impl Journal {
         }
     }
 
-    /// Writes a checkpoint, and returns when it is complete.
+    /// Writes a checkpoint and waits until it is complete.
     ///
     /// # Errors
     /// One line.
@@ -187,7 +188,7 @@ impl Journal {
         saved.map(drop).map_err(RunError::NotSaved)
     }
 
-    /// Returns when the checkpoint that is being written is complete.
+    /// Waits until the checkpoint that is being written is complete.
     ///
     /// # Errors
     /// One line, if it could not be written.
@@ -236,7 +237,7 @@ impl Observer for Journal {
             Event::StageEntered { stage, step, seconds } => self.stage(stage.clone(), *step, *seconds),
             Event::Finished { step, seconds, .. } => self.end_stage(*step, *seconds),
             Event::Warned { message } => self.warnings.push(message.clone()),
-            // On a GPU the state would be read back for this.
+            // Not on a GPU, where this would read the state back.
             Event::Started { .. } | Event::Densified { .. } if !trainer.engine.is_on_gpu() => {
                 self.saver.prepare(trainer.engine.state(), trainer.recipe.max_splats);
             }

@@ -1,4 +1,4 @@
-//! Levels of detail beside a splat file: a half, a quarter and an eighth of its splats, merged so that they look alike from afar.
+//! Levels of detail beside a splat file: a half, a quarter and an eighth of its splats, merged so that they look the same from afar.
 
 use crate::folder::cameras_beside;
 use crate::orbit::orbit;
@@ -11,15 +11,15 @@ use irradia_train::model::Model;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Levels beside a scene; each has half of the splats of the one before.
+/// Number of levels beside a scene; each has half as many splats as the one before.
 pub const LEVELS: u32 = 3;
-/// Views in which levels are compared, at most.
+/// Maximum number of views in which levels are compared.
 const VIEWS: u32 = 12;
-/// Pixels of the largest compared picture where no cameras are known.
+/// Width and height of the compared renders if no cameras are known, pixels.
 const SIZE: (u32, u32) = (640, 480);
 
-/// A level that was written. PSNRs are those of pictures with `1 / 2^level` of the pixels, as from so much further away, against the
-/// picture of the whole scene at full size, shrunk by area; means over views, dB.
+/// A level that was written. Each PSNR compares renders with `1 / 2^level` of the pixels, as seen from correspondingly further away, with
+/// the render of the whole scene at full size, downscaled by area; means over views, dB.
 #[derive(Clone, Debug)]
 pub struct Level {
     /// The file.
@@ -30,30 +30,30 @@ pub struct Level {
     pub bytes: u64,
     /// PSNR of the level.
     pub psnr: f64,
-    /// Of as many splats taken evenly from the scene.
+    /// PSNR of equally many splats taken evenly from the scene.
     pub subsample_psnr: f64,
-    /// Of the whole scene drawn at that size: its small splats are widened to a pixel each.
+    /// PSNR of the whole scene rendered at that size, where small splats are widened to a pixel each.
     pub whole_psnr: f64,
 }
 
 /// The file of level `level` of the scene in the file `path`: `a.lod1.sog` for `a.sog`.
 ///
 /// # Errors
-/// When the format is unknown, or is a folder.
+/// When the format is unknown, or is a folder of images.
 pub fn level_file(path: &Path, level: u32) -> Result<PathBuf, RunError> {
     let format = SplatFormat::of(path)?;
     let name = path.file_name().unwrap_or_default().to_string_lossy();
     let stem = name.len().saturating_sub(format.suffix().len());
     match (format, name.get(..stem)) {
         (SplatFormat::SogFolder, _) | (_, None) => Err(RunError::Refused(format!(
-            "{}: levels of detail go beside a file: choose .sog",
+            "{}: levels of detail need a scene in a single file: choose .sog",
             path.display()
         ))),
         (_, Some(stem)) => Ok(path.with_file_name(format!("{stem}.lod{level}{}", format.suffix()))),
     }
 }
 
-/// Writes a scene as [`write_splats_with`] does; the levels beside the one that was there go.
+/// Writes a scene like [`write_splats_with`], and removes the levels beside it, which belong to the scene that it replaces.
 pub(crate) fn write_scene(path: &Path, cloud: &GaussianCloud, options: &WriteOptions) -> Result<Vec<String>, RunError> {
     for level in 1..=LEVELS {
         let Ok(file) = level_file(path, level) else { break };
@@ -64,7 +64,7 @@ pub(crate) fn write_scene(path: &Path, cloud: &GaussianCloud, options: &WriteOpt
     Ok(write_splats_with(path, cloud, options)?)
 }
 
-/// Writes the levels of the scene `input` beside `output`, and compares them from where its training cameras are.
+/// Writes the levels of the scene `input` beside `output`, and compares them in views of its training cameras.
 ///
 /// # Errors
 /// When the input cannot be read, or a level cannot be written.
@@ -123,10 +123,10 @@ pub fn write_levels(input: &Path, output: &Path, options: &WriteOptions) -> Resu
     Ok(levels)
 }
 
-/// The levels beside the scene in the file `path`, which has `count` splats, in their order; those of another scene are not taken.
+/// The levels beside the scene in the file `path`, which has `count` splats, in order; levels of another scene are ignored.
 ///
 /// # Errors
-/// When a level is there and cannot be read.
+/// When a level exists and cannot be read.
 pub fn read_levels(path: &Path, count: usize) -> Result<Vec<Splats>, RunError> {
     let mut levels = Vec::new();
     for level in 1..=LEVELS {
@@ -135,7 +135,7 @@ pub fn read_levels(path: &Path, count: usize) -> Result<Vec<Splats>, RunError> {
             break;
         }
         let splats = Splats::from_cloud(&read_splats(&file)?);
-        // Splats that are never seen are not merged, and may leave a few less.
+        // Splats that are never seen are left out before merging, so there may be slightly fewer.
         let expected = count.div_ceil(1 << level);
         if splats.len() > expected || splats.len() < expected / 2 {
             break;
@@ -156,7 +156,7 @@ fn compared_cameras(input: &Path, cloud: &GaussianCloud, splats: &Splats) -> Vec
     }
 }
 
-/// Of pictures of 8 bits, dB; at most that of a single difference.
+/// PSNR of 8-bit images, dB; equal images get that of a single difference of one.
 fn psnr(a: &[u8], b: &[u8]) -> f64 {
     let squares = a.iter().zip(b).map(|(a, b)| u64::from(a.abs_diff(*b)).pow(2));
     let sum = squares.sum::<u64>().max(1) as f64;

@@ -97,7 +97,7 @@ pub use scene_file::{Scene, check_kept, read_lights, read_vignette, scene_of};
 pub use snapshot::{Snapshot, Snapshots};
 pub use synth_files::{SynthSummary, write_synth_dataset};
 
-/// The names that a program which trains or renders needs.
+/// The names that a program needs to train or render.
 pub mod prelude {
     pub use crate::scene::{Camera, Dataset, Image, Intrinsics, Pose};
     pub use crate::synth::SynthOptions;

@@ -10,9 +10,8 @@ const NAME: &str = ".lock";
 
 /// Held while a run may write into its folder.
 ///
-/// The lock is the system's own on an open file, not the file's existence: it is released when its process ends in any way, so
-/// that no lock is ever stale, and network file systems honour it across hosts. On a file system without locks, nothing is
-/// locked and nothing rejected.
+/// This is a system lock on an open file, not the existence of a file: the system releases it whenever the process ends, so no lock
+/// is ever stale, and network file systems honour it across hosts. On a file system without locks, nothing is locked or rejected.
 #[derive(Debug)]
 pub(crate) struct FolderLock {
     _file: Option<File>,
@@ -22,7 +21,7 @@ impl FolderLock {
     /// Locks `folder`, which exists.
     ///
     /// # Errors
-    /// When another process, or another run of this one, holds the lock; when the file cannot be created.
+    /// When another process, or another run in this process, holds the lock; when the file cannot be created.
     pub fn take(folder: &Path) -> Result<Self, RunError> {
         let path = folder.join(NAME);
         let opened = OpenOptions::new()
@@ -56,7 +55,7 @@ impl FolderLock {
         folder.join(NAME).is_file()
     }
 
-    /// [`Self::take`] if a run has left its lock file: fails early, and leaves no file in other folders.
+    /// [`Self::take`] if a run has left its lock file. It fails early and creates no file in other folders.
     pub fn take_existing(folder: &Path) -> Result<Option<Self>, RunError> {
         Self::was_taken(folder).then(|| Self::take(folder)).transpose()
     }

@@ -1,4 +1,4 @@
-//! Where a scene is seen from: its centre and up axis, and cameras on a circle around it.
+//! Where a scene is viewed from: its centre and up axis, and cameras on a circle around it.
 
 use std::f32::consts::{FRAC_PI_2, PI, TAU};
 
@@ -8,12 +8,12 @@ use irradia_sfm::geometry::pose::DPose;
 use irradia_sfm::upright;
 use irradia_splat::{Splats, init::focus_point};
 
-/// From where a scene is seen.
+/// Where a scene is viewed from.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Outlook {
-    /// The focus of the training cameras, the ground below those of a survey, or the middle of most splats; world.
+    /// The focus of the training cameras, the ground below the cameras of a survey, or the middle of most splats; world.
     pub center: Vec3,
-    /// Unit vector, as the cameras were held.
+    /// Unit vector, derived from how the cameras were held.
     pub up: Vec3,
     /// Mean distance of the cameras from the axis through the centre along `up`, world units.
     pub radius: f32,
@@ -23,10 +23,10 @@ pub struct Outlook {
     pub intrinsics: Intrinsics,
 }
 
-/// Splats that tell how far the ground of a survey is.
+/// Maximum number of splats that are sampled to find the ground of a survey.
 const SAMPLE: usize = 10_000;
 
-/// From the training cameras; for a scene without them, from the distribution of its splats.
+/// The outlook from the training cameras; for a scene without them, from the distribution of its splats.
 pub(crate) fn outlook(splats: Option<&Splats>, cameras: Option<&[Camera]>) -> Outlook {
     match cameras.filter(|cameras| !cameras.is_empty()) {
         Some(cameras) => {
@@ -56,12 +56,12 @@ pub(crate) fn outlook(splats: Option<&Splats>, cameras: Option<&[Camera]>) -> Ou
             let axes = [0, 1, 2].map(|c| {
                 let at = quantiles(&|splats| splats.means.plane(c));
                 let [first, low, high, last] = [0.02, 0.1, 0.9, 0.98].map(|share| at(share).unwrap_or(0.0));
-                // All of an object, and not the far surroundings of a scene.
+                // Includes all of an object, but not the far surroundings of a scene.
                 let (middle, reach) = (0.5 * (low + high), 0.75 * (high - low));
                 let (low, high) = (first.max(middle - reach), last.min(middle + reach));
                 (0.5 * (low + high), high - low)
             });
-            // A few splats in one place are as large as themselves.
+            // For a few splats in one place, the extent of the splats themselves counts.
             let sizes = [0, 1, 2].map(|c| quantiles(&|splats| splats.log_scales.plane(c))(0.5).map_or(0.0, f32::exp));
             let size = axes
                 .iter()
@@ -72,7 +72,7 @@ pub(crate) fn outlook(splats: Option<&Splats>, cameras: Option<&[Camera]>) -> Ou
                 center: Vec3::from_array(axes.map(|a| a.0)),
                 // Most files of this kind come from COLMAP, whose y axis points down.
                 up: Vec3::NEG_Y,
-                // A picture of 16:9 is 0.61 of its distance high.
+                // A 16:9 view is 0.61 of its distance high.
                 radius: 2.0 * size,
                 height: 0.5 * size,
                 intrinsics: Intrinsics::from_fov_x(1280, 720, 1.0),
@@ -102,12 +102,12 @@ fn center_and_up(splats: Option<&Splats>, cameras: &[Camera]) -> (Vec3, Vec3) {
     }
 }
 
-/// A gap between the azimuths of adjacent cameras, beyond which what lies there was not photographed; radians.
+/// A gap between the azimuths of adjacent cameras beyond which that side counts as not photographed, radians.
 const GAP: f32 = FRAC_PI_2;
-/// The least half-width of an arc, for cameras that hardly move, radians.
+/// Minimum half-width of an arc, for cameras that hardly move, radians.
 const LEAST_HALF: f32 = 0.1;
 
-/// The middle and half the width of the arc that holds all `azimuths`, radians; `None` where they lie all around.
+/// The middle and half the width of the arc that contains all `azimuths`, radians; `None` if there is no azimuth, or they are all around.
 fn arc(mut azimuths: Vec<f32>) -> Option<(f32, f32)> {
     azimuths.sort_unstable_by(f32::total_cmp);
     let n = azimuths.len();
@@ -116,13 +116,13 @@ fn arc(mut azimuths: Vec<f32>) -> Option<(f32, f32)> {
         .map(|i| (i, next(i) - azimuths[i]))
         .max_by(|a, b| a.1.total_cmp(&b.1))?;
     let half = 0.5 * (TAU - gap);
-    // Between -pi and pi, as azimuths are.
+    // Between -pi and pi, like the azimuths.
     let middle = (next(last) + half + PI).rem_euclid(TAU) - PI;
     (gap > GAP).then_some((middle, half.max(LEAST_HALF)))
 }
 
-/// A circle around the centre of the scene, at the training cameras' mean distance and height; there and back where these stand on one side of it.
-/// It starts at the azimuth of the first camera.
+/// A circle around the centre of the scene, at the training cameras' mean distance and height; back and forth on an arc if these are on
+/// one side of it. The path starts at the azimuth of the first camera.
 pub(crate) fn orbit(
     splats: Option<&Splats>,
     cameras: Option<&[Camera]>,

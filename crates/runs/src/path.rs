@@ -1,8 +1,8 @@
-//! Camera paths: key frames with smooth cameras between them, and ready-made paths around a scene. The page of the viewer has a
-//! twin (`crates/viewer/page/js/path.js`), and saves the files that are read here.
+//! Camera paths: key frames with smooth interpolation between them, and ready-made paths around a scene. The viewer's page has a
+//! twin (`crates/viewer/page/js/path.js`), which saves the files that are read here.
 //!
-//! Positions and fields of view follow a Catmull-Rom spline whose tangents are the differences of the neighbours over their
-//! times; rotations are interpolated by squad (Shoemake, "Quaternion calculus and fast animation", 1987).
+//! Positions and fields of view follow a Catmull-Rom spline whose tangents are the differences of the neighbouring keys divided by those
+//! of their times; rotations are interpolated by squad (Shoemake, "Quaternion calculus and fast animation", 1987).
 
 use crate::{RunError, Scene};
 use glam::{DVec3, Mat3, Quat, Vec3};
@@ -12,18 +12,20 @@ use std::f32::consts::TAU;
 use std::fs;
 use std::path::Path;
 
-/// Frames of a path at most.
+/// Maximum number of frames of a path.
 const MAX_FRAMES: usize = 100_000;
-/// The mean of the training cameras is within the scene if it is nearer to the centre than this part of their distance; half a ring's is at 0.64.
+/// The mean position of the training cameras counts as inside the scene if it is closer to the centre than this fraction of their
+/// distance; that of half a ring is at 0.64.
 const WITHIN: f32 = 0.5;
-/// How much nearer to the scene's centre, in units of its distance, a spiral comes: cameras half around leave their mean beside what they show.
+/// How far a spiral may move towards the scene's centre, as a fraction of the distance between them: the mean of cameras half around a
+/// scene is close to the subject.
 const NEARER: f32 = 0.3;
-/// How far a spiral all around rises and falls, in units of its radius.
+/// How far a spiral all around a scene rises and falls, in units of its radius.
 const RISES: f32 = 0.3;
 /// Range of frames per second.
 const FPS: std::ops::RangeInclusive<f32> = 0.1..=240.0;
 
-/// A camera at a time.
+/// A camera at a point in time.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PathKey {
     /// Seconds from the start.
@@ -46,11 +48,11 @@ pub struct CameraPath {
     /// Whether the last key is followed by the first one.
     #[serde(rename = "loop")]
     pub loops: bool,
-    /// Whether it starts and ends slowly; a loop does not.
+    /// Whether the path starts and ends slowly; ignored for a loop.
     pub ease: bool,
-    /// Seconds from the last key to the first one of a loop.
+    /// Seconds from the last key back to the first one in a loop.
     pub closing: f32,
-    /// At least one.
+    /// The key frames, at least one.
     pub keys: Vec<PathKey>,
 }
 
@@ -66,25 +68,25 @@ struct Nerfstudio {
 struct NerfstudioCamera {
     /// Row-major 4 x 4, OpenGL's axes (x right, y up, z backward).
     camera_to_world: Vec<f64>,
-    /// Vertical, degrees.
+    /// Vertical field of view, degrees.
     fov: f32,
 }
 
-/// The cameras of every frame, and frames per second.
+/// The camera of every frame, and frames per second.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Film {
-    /// In order.
+    /// The cameras, in order.
     pub cameras: Vec<Camera>,
     /// Frames per second.
     pub fps: f32,
 }
 
 impl Film {
-    /// Reads a path that the viewer has saved, or a `camera_path.json` of nerfstudio in the coordinates of the dataset, of which `world` tells those of the scene;
-    /// frames have `width` x `height` pixels.
+    /// Reads a path saved by the viewer, or a `camera_path.json` of nerfstudio in the dataset's coordinates, which `world` maps to those of
+    /// the scene. Frames have `width` x `height` pixels.
     ///
     /// # Errors
-    /// When the file cannot be read or is no such path.
+    /// When the file cannot be read, or is not such a path.
     pub fn read(path: &Path, world: &Similarity, (width, height): (u32, u32)) -> Result<Self, RunError> {
         let text = fs::read_to_string(path).map_err(RunError::io("read", path))?;
         let wrong = |reason: &str| RunError::Damaged {
@@ -92,7 +94,7 @@ impl Film {
             reason: reason.to_owned(),
         };
         let value: serde_json::Value =
-            serde_json::from_str(&text).map_err(|error| wrong(&format!("no camera path: {error}")))?;
+            serde_json::from_str(&text).map_err(|error| wrong(&format!("not a camera path: {error}")))?;
         if value.get("camera_path").is_some() {
             let file: Nerfstudio = serde_json::from_value(value).map_err(|error| wrong(&error.to_string()))?;
             let cameras: Option<Vec<Camera>> = file
@@ -103,12 +105,12 @@ impl Film {
                 .collect();
             let cameras = cameras.filter(|cameras| !cameras.is_empty());
             return Ok(Self {
-                cameras: cameras.ok_or_else(|| wrong("a camera of the path is not a pose with a field of view"))?,
+                cameras: cameras.ok_or_else(|| wrong("a camera of the path has no valid pose or field of view"))?,
                 fps: file.fps.filter(|fps| FPS.contains(fps)).unwrap_or(30.0),
             });
         }
         let path: CameraPath =
-            serde_json::from_value(value).map_err(|error| wrong(&format!("no camera path: {error}")))?;
+            serde_json::from_value(value).map_err(|error| wrong(&format!("not a camera path: {error}")))?;
         path.check().map_err(wrong)?;
         Ok(path.film((width, height)))
     }
@@ -121,8 +123,9 @@ impl Film {
         }
     }
 
-    /// `frames` cameras on two turns of an elliptic spiral about the training cameras' mean, looking at the scene's centre: the path
-    /// of LLFF (Mildenhall et al. 2019) for forward-facing captures. The mean of cameras all around is within the scene: there the turns are an orbit that rises and falls.
+    /// `frames` cameras on two turns of an elliptic spiral about the training cameras' mean position, looking at the scene's centre: the
+    /// path of LLFF (Mildenhall et al. 2019) for forward-facing captures. If the cameras are all around the scene, their mean is inside it,
+    /// and the path is two turns of an orbit that rises and falls.
     pub fn spiral(scene: &Scene, frames: u32, size: Option<(u32, u32)>) -> Self {
         let outlook = scene.outlook();
         let around = scene.orbit(32, None);
@@ -161,7 +164,7 @@ impl Film {
         }
     }
 
-    /// `frames` cameras on two turns of an orbit, or of its arc, that rises and falls.
+    /// `frames` cameras on two turns of a rising and falling orbit, or on its arc.
     fn rising(scene: &Scene, frames: u32, size: Option<(u32, u32)>) -> Self {
         let outlook = scene.outlook();
         let turn = scene.orbit(frames.div_ceil(2), size);
@@ -238,17 +241,17 @@ fn seen(pose: Pose, fov: f32, width: u32, height: u32) -> Camera {
 }
 
 impl CameraPath {
-    /// What is wrong with it.
+    /// Checks the path; the error says what is wrong.
     fn check(&self) -> Result<(), &'static str> {
         let finite = |key: &PathKey| {
             let numbers = [key.time, key.fov].into_iter().chain(key.position).chain(key.rotation);
             numbers.into_iter().all(f32::is_finite) && key.rotation.iter().any(|v| *v != 0.0)
         };
         if self.irradia_path != 1 {
-            return Err("this version of camera paths is not known");
+            return Err("unknown version of the camera path format");
         }
         if self.keys.is_empty() || !self.keys.iter().all(finite) {
-            return Err("a key frame is not a pose, or there is none");
+            return Err("there are no key frames, or one has no valid pose");
         }
         if !self
             .keys
@@ -258,10 +261,10 @@ impl CameraPath {
             return Err("a field of view must be above 0 and below pi");
         }
         if self.keys[0].time != 0.0 || self.keys.windows(2).any(|pair| pair[0].time > pair[1].time) {
-            return Err("the times of key frames must grow from 0");
+            return Err("the times of key frames must start at 0 and not decrease");
         }
         if !FPS.contains(&self.fps) || !(0.0..1e6).contains(&self.closing) {
-            return Err("frames per second must be 0.1 to 240, and closing seconds");
+            return Err("frames per second must be 0.1 to 240, and closing 0 to 1,000,000 seconds");
         }
         if self.seconds() * self.fps > MAX_FRAMES as f32 {
             return Err("it has more than 100,000 frames");
@@ -279,7 +282,7 @@ impl CameraPath {
         }
     }
 
-    /// Every frame; a loop's last frame leads to its first.
+    /// All frames; the last frame of a loop leads back to the first.
     fn film(&self, (width, height): (u32, u32)) -> Film {
         let steps = (self.seconds() * self.fps).round() as usize;
         let frames = if self.loops { steps.max(1) } else { steps + 1 };
@@ -365,7 +368,7 @@ impl CameraPath {
             time: seconds,
             position: [0, 1, 2].map(|c| spline(&|key: &PathKey| key.position[c])),
             rotation: [rotation.w, rotation.x, rotation.y, rotation.z],
-            // A spline that goes beyond its ends would turn pictures over.
+            // Clamped: a field of view that overshoots its keys could turn the image upside down.
             fov: spline(&|key: &PathKey| key.fov).clamp(k1.fov.min(k2.fov), k1.fov.max(k2.fov)),
         }
     }
@@ -389,7 +392,7 @@ fn exp(v: Vec3) -> Quat {
     Quat::from_xyzw(axis.x, axis.y, axis.z, angle.cos())
 }
 
-/// Spherical interpolation along the shorter way.
+/// Spherical linear interpolation along the shorter arc.
 fn slerp(a: Quat, b: Quat, t: f32) -> Quat {
     let cosine = a.dot(b);
     let (b, cosine) = if cosine < 0.0 { (-b, -cosine) } else { (b, cosine) };

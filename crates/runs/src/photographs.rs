@@ -1,4 +1,4 @@
-//! The photographs of a run, small, for the search for floaters.
+//! Reduced photographs of a run, for the search for floaters.
 
 use crate::folder::camera_names_beside;
 use crate::scene_file::render_knobs_beside;
@@ -8,12 +8,12 @@ use irradia_scene::Photo;
 use rayon::prelude::*;
 use std::path::Path;
 
-/// Longest side, pixels. Much smaller ones would be rendered unlike the scene was trained: splats are widened to a pixel.
+/// Longer side, pixels. At much smaller sizes renders would differ from those in training, since splats are widened to a pixel.
 const SIDE: f32 = 480.0;
-/// At most so many, spread evenly over the cameras.
+/// Maximum number of photographs, spread evenly over the cameras.
 const MOST: usize = 24;
 
-/// The photographs with which the scene `scene` was trained, if its run is beside it and they are where they were.
+/// The photographs on which the scene `scene` was trained, if it is in its run's folder and they are still in place.
 pub fn photographs_of(scene: &Path) -> Option<Photographs> {
     RunFolder::containing(scene)?;
     let scene = scene.to_owned();
@@ -23,7 +23,7 @@ pub fn photographs_of(scene: &Path) -> Option<Photographs> {
 fn read(scene: &Path) -> Option<Taken> {
     let input = TrainInput::of_run(scene.parent()?).ok()?;
     let dataset = input.reading.read(&input.data).ok()?;
-    // The cameras of the scene are pinholes: photographs with distortion or a rolling shutter show something else.
+    // The scene's cameras are pinholes: photographs with distortion or a rolling shutter do not match them.
     if dataset.views.iter().any(|view| !view.camera.is_pinhole()) {
         return None;
     }

@@ -53,7 +53,7 @@ impl Protocol {
         }
     }
 
-    /// The background of training and evaluation, of photographs with alpha.
+    /// The background of photographs with alpha, in training and evaluation.
     pub fn background(self) -> Option<Background> {
         (self == Protocol::Blender).then_some(Background::White)
     }
@@ -69,8 +69,8 @@ impl Protocol {
         }
     }
 
-    /// What about `dataset`, read by [`Self::reading`], differs from the benchmark's scene `scene`, so that figures are not comparable:
-    /// one line each.
+    /// The differences between `dataset`, read by [`Self::reading`], and the benchmark's scene `scene` that make figures incomparable, a
+    /// line each.
     pub fn differences(self, scene: &str, dataset: &Dataset) -> Vec<String> {
         let mut differences = Vec::new();
         let views = dataset.test.iter().map(|i| &dataset.views[*i].camera.intrinsics);

@@ -1,4 +1,4 @@
-//! The data of a run, to detect changes.
+//! Fingerprints of a run's data and of the program, to detect changes.
 
 use irradia_scene::{Dataset, Lens};
 use serde::{Deserialize, Serialize};

@@ -24,7 +24,7 @@ pub const HOW_TO_GET_LPIPS: &str = "import the weights once with irradia lpips -
 /// The default recipe: the best for its time on all scenes of RESULTS.md.
 pub const DEFAULT_RECIPE: &str = "fast";
 
-/// Largest factor on the length of a recipe for many photographs: 30,000 steps of `fast`, as long as 3DGS.
+/// Maximum factor by which many photographs lengthen a recipe: 30,000 steps of `fast`, as many as 3DGS makes.
 const MOST_STRETCHED: u64 = 10;
 
 /// How to read a dataset, not validated.
@@ -43,13 +43,13 @@ pub struct Reading {
     /// `None`: those that the dataset itself holds out, every 8th if it does not define any.
     #[serde(default)]
     pub holdout: Option<String>,
-    /// The folder of the photographs, if it is not where the layout has it.
+    /// The folder of the photographs, if it is not where the layout expects it.
     #[serde(default)]
     pub images: Option<PathBuf>,
-    /// What becomes of distorted photographs.
+    /// How distorted photographs are handled.
     #[serde(default)]
     pub lenses: Lenses,
-    /// The readout of the film of which the photographs are frames, in the form of [`Readout`].
+    /// The readout of the film whose frames the photographs are, in the form of [`Readout`].
     #[serde(default)]
     pub readout: Option<String>,
 }
@@ -108,6 +108,26 @@ impl Reading {
             lenses: self.lenses,
             readout,
         })
+    }
+
+    /// These settings over those of a run: where they are the defaults, those of `run` apply.
+    pub fn over(&self, run: Self) -> Self {
+        let default = Self::default();
+        let is_scaled = self.downscale != default.downscale || self.max_side != default.max_side;
+        let size = if is_scaled { self } else { &run };
+        Self {
+            downscale: size.downscale,
+            max_side: size.max_side,
+            format: self.format.clone().or(run.format),
+            holdout: self.holdout.clone().or(run.holdout),
+            images: self.images.clone().or(run.images),
+            lenses: if self.lenses == default.lenses {
+                run.lenses
+            } else {
+                self.lenses
+            },
+            readout: self.readout.clone().or(run.readout),
+        }
     }
 
     fn holdout(&self) -> Result<Holdout, RunError> {
@@ -175,7 +195,7 @@ pub struct TrainInput {
     pub steps: Option<u64>,
     /// Seconds of training into which the recipe is fitted; not together with `steps`.
     pub budget: Option<f64>,
-    /// The folder of a run whose steps are repeated at their recorded pace; with neither `steps` nor `budget`.
+    /// The folder of a run whose steps are repeated at their recorded pace; not together with `steps` or `budget`.
     #[serde(default)]
     pub replay: Option<PathBuf>,
     /// Held-out PSNR at which to stop, dB.
@@ -194,13 +214,13 @@ pub struct TrainInput {
     /// How the dataset is read.
     #[serde(flatten)]
     pub reading: Reading,
-    /// What is behind the scene. `None`: what [`Background::usual`] finds in the photographs, otherwise the recipe's.
+    /// The background of the scene. `None`: what [`Background::usual`] finds in the photographs, otherwise the recipe's.
     #[serde(default)]
     pub background: Option<Background>,
-    /// A scene whose splats the training begins with, a file or a run's folder, in the coordinates of the dataset.
+    /// A scene with whose splats the training begins: a file or a run's folder, in the coordinates of the dataset.
     #[serde(default)]
     pub from: Option<PathBuf>,
-    /// Whether points are found by matching the photographs where the dataset has poses and no points; splats begin at random positions otherwise.
+    /// Whether to find points by matching the photographs if the dataset has none; otherwise splats begin at random positions.
     #[serde(default)]
     pub match_points: bool,
     /// Where the scene is trained: `cpu`, `gpu`, `auto` (a real GPU if there is one), or a part of a GPU's name.
@@ -220,7 +240,7 @@ fn default_recipe() -> String {
 }
 
 impl TrainInput {
-    /// Trains on the dataset in `data` with the default recipe and writes the run to `out`.
+    /// A request to train on the dataset in `data` with the default recipe and to write the run to `out`.
     pub fn new(data: impl Into<PathBuf>, out: impl Into<PathBuf>) -> Self {
         Self {
             data: data.into(),
@@ -265,8 +285,8 @@ impl TrainInput {
         Ok(input)
     }
 
-    /// Repeats the run in the folder `run` into the folder `out`: the same data, recipe and seed, each step at its recorded pace,
-    /// so that the scene has the same bytes, even if a budget set the pace by the clock.
+    /// A request to repeat the run in the folder `run` in the folder `out`: the same data, recipe and seed, each step at its recorded
+    /// pace, so that the scene has the same bytes even if a budget set the pace by the clock.
     ///
     /// # Errors
     /// Those of [`TrainInput::of_run`].
@@ -303,13 +323,22 @@ impl TrainInput {
         if let (Some(steps), Some(_)) = (self.steps, self.budget) {
             return Err(RunError::setting("steps", steps, "cannot be combined with a budget"));
         }
+        if let (Some(_), Some(steps)) = (&self.replay, self.steps) {
+            return Err(RunError::setting("steps", steps, "cannot be combined with a replay"));
+        }
+        if let (Some(_), Some(budget)) = (&self.replay, self.budget) {
+            return Err(RunError::setting("budget", budget, "cannot be combined with a replay"));
+        }
         if let Some(psnr) = self.until_psnr.filter(|psnr| !psnr.is_finite()) {
             return Err(RunError::setting("until_psnr", psnr, "must be a number of dB"));
         }
         self.reading = self.reading.with_absolute_paths();
         let reading = self.reading.check()?;
         let recipe = read_recipe(&self.recipe, &self.overrides())?;
-        self.data = std::path::absolute(&self.data).unwrap_or(self.data);
+        let absolute = |path: PathBuf| std::path::absolute(&path).unwrap_or(path);
+        self.data = absolute(self.data);
+        self.lpips = self.lpips.map(absolute);
+        self.unseen_lpips = self.unseen_lpips.map(absolute);
         if let Some(from) = &mut self.from {
             if recipe.stage[0].represents == Represents::Field {
                 let message = format!("recipe {} begins with a field, not with splats", recipe.name);
@@ -381,13 +410,14 @@ impl TrainRequest {
         Ok(read_dataset(&self.input.data, &self.reading)?)
     }
 
-    /// Whether a run on `dataset` finds points by matching its photographs, which takes a moment for each: it has poses and no points, and the splats to begin
-    /// with are not given. Rendered scenes need none, since their alpha tells what is empty.
+    /// Whether a run on `dataset` finds points by matching its photographs, which takes a moment per photograph: it does if the dataset has
+    /// no points and no initial splats are given. Rendered scenes need no points, since their alpha shows what is empty.
     pub fn matches_points(&self, dataset: &Dataset) -> bool {
         self.input.match_points && self.input.from.is_none() && are_missing(dataset)
     }
 
-    /// `dataset` with points where [`Self::matches_points`], the same for any number of threads, and what was found.
+    /// `dataset`, with points added if [`Self::matches_points`], and a message about what was found. The points are the same for any
+    /// number of threads.
     pub(crate) fn with_points(&self, mut dataset: Dataset) -> (Dataset, Option<String>) {
         if !self.matches_points(&dataset) {
             return (dataset, None);
@@ -422,7 +452,8 @@ impl TrainRequest {
         missing.then(line).into_iter().collect()
     }
 
-    /// Puts the recipe's changes for runs without a number of steps or a budget before those of the input, which take precedence.
+    /// If neither steps, budget nor replay are given, puts the recipe's changes for such runs before those of the input, which take
+    /// precedence.
     pub(crate) fn choose_changes(&mut self) -> Result<(), RunError> {
         let input = &mut self.input;
         let is_free = input.steps.is_none() && input.budget.is_none() && input.replay.is_none();
@@ -433,7 +464,8 @@ impl TrainRequest {
         Ok(())
     }
 
-    /// Sets the number of steps if neither the input does nor a budget, and the recipe's own length would visit photographs too seldom.
+    /// Sets the number of steps if the input gives neither steps, budget nor replay, and the recipe's own length would visit each
+    /// photograph too rarely.
     pub(crate) fn choose_length(&mut self, dataset: &Dataset) {
         let own = self.recipe.total_steps();
         let wanted = self.recipe.visits.saturating_mul(dataset.train.len() as u64);
@@ -443,10 +475,10 @@ impl TrainRequest {
         }
     }
 
-    /// Sets the background that is usual for the photographs, if neither the input nor its overrides of the recipe set one.
+    /// Sets the default background for the photographs if neither the input nor its overrides of the recipe set one.
     pub(crate) fn choose_background(&mut self, dataset: &Dataset) -> Result<(), RunError> {
         if self.input.replay.is_some() && self.input.background.is_none() {
-            // The recipe of the run to repeat has it.
+            // The recipe of the run to repeat already contains it.
             return Ok(());
         }
         let is_set = self
@@ -468,14 +500,14 @@ impl TrainRequest {
         Ok(())
     }
 
-    /// The splats to begin with, in the world of `dataset`, with room for all bands; and whether they need antialiasing.
+    /// The initial splats, in the world of `dataset`, with room for all SH bands, and whether they need antialiasing.
     pub(crate) fn first_splats(&self, dataset: &Dataset) -> Result<Option<(Splats, bool)>, RunError> {
         let Some(from) = &self.input.from else { return Ok(None) };
         let path = scene_of(from);
         let mut cloud = read_splats(&path)?;
         if cloud.is_empty() {
             return Err(RunError::Refused(format!(
-                "{} has no splats to begin with",
+                "{} contains no splats to start from",
                 path.display()
             )));
         }

@@ -42,9 +42,9 @@ impl Run {
         Ok(())
     }
 
-    /// Evaluates the held-out views, writes their pictures, and creates the report.
+    /// Evaluates the held-out views, writes their images, and creates the report.
     ///
-    /// `finishing` is when the run began to finish; `stop`, polled after each view, aborts.
+    /// `finishing` is when the run began to finish; `stop`, polled after each view, ends the evaluation.
     pub(crate) fn report(&self, finishing: Instant, stop: &dyn Fn() -> bool) -> Result<Report, RunError> {
         let (trainer, input, journal) = (&self.trainer, &self.request.input, &self.journal);
         let names = trainer.dataset.views.iter().map(|view| view.name.as_str());
@@ -137,7 +137,7 @@ impl Run {
     pub(crate) fn write_report(&self, report: &Report) -> Result<(), RunError> {
         let mut json = serde_json::to_value(report).expect("plain data");
         if let Some(fields) = json.as_object_mut().filter(|_| report.views.is_empty()) {
-            // Missing values are not written; with held-out views, null means that there was no network.
+            // Without held-out views, missing values are omitted; with them, null means that there was no network.
             fields.retain(|_, value| !value.is_null());
         }
         self.folder.write("report.json", &to_json(&json))?;
@@ -160,7 +160,7 @@ pub fn write_image(path: impl AsRef<Path>, image: &Image) -> Result<(), RunError
     )?)
 }
 
-/// What trained and measured: the GPU, if one was asked for, and the CPU.
+/// The devices that trained and measured: the GPU, if one was requested, and the CPU.
 fn device(trainer: &Trainer) -> String {
     let cpu = format!(
         "CPU, {} threads, {}",

@@ -43,7 +43,7 @@ pub struct Run {
     pub(crate) journal: Journal,
     snapshots: SnapshotServer,
     pub(crate) unseen_lpips: Option<Lpips>,
-    /// The paces to repeat of another run.
+    /// The paces of another run to repeat.
     paces: Option<Paces>,
     /// Seconds between the request and the first step.
     pub(crate) preparing: Option<f64>,
@@ -65,8 +65,8 @@ impl Run {
     /// Begins a run in a folder of its own.
     ///
     /// # Errors
-    /// When the folder contains a run that the request does not replace, or the dataset cannot be trained on. Nothing is
-    /// written then.
+    /// When the folder contains a run that the request does not replace, or the dataset cannot be trained on. In these cases nothing is
+    /// written.
     pub fn begin(request: TrainRequest) -> Result<Self, RunError> {
         RunFolder::check_free(&request.input.out, request.input.overwrite)?;
         let dataset = request.read_dataset()?;
@@ -81,7 +81,7 @@ impl Run {
         if dataset.test.is_empty()
             && let Some(psnr) = request.input.until_psnr
         {
-            let message = "no view is held out, so that PSNR cannot be measured";
+            let message = "no view is held out, so PSNR cannot be measured";
             return Err(RunError::setting("until_psnr", psnr, message));
         }
         request.choose_changes()?;
@@ -129,7 +129,7 @@ impl Run {
         folder.remove_leftovers()?;
         let options = train_options(&request)?;
         let paces = request.paces()?;
-        // The world of the steps made, which an earlier version may have chosen otherwise.
+        // The world in which the previous steps were made; an earlier version may have chosen another one.
         let (dataset, _) = request.with_points(dataset.in_world(folder.world_from_dataset()?));
         let dataset = Arc::new(dataset);
         let trainer = match folder.newest_checkpoint()? {
@@ -204,7 +204,7 @@ impl Run {
     /// [`Signal::Stop`](irradia_train::event::Signal::Stop); returns the reason. A stopped run may be trained further.
     ///
     /// # Errors
-    /// When a photograph cannot be read; completed steps are saved nevertheless.
+    /// When a photograph cannot be read; completed steps are still saved.
     pub fn train(&mut self, observers: &mut [&mut dyn Observer]) -> Result<String, RunError> {
         let started = self.request.started;
         self.preparing.get_or_insert_with(|| started.elapsed().as_secs_f64());
@@ -234,7 +234,7 @@ impl Run {
     }
 
     /// Writes the scene, evaluates it on the held-out views, and writes the report. A run that has not completed its
-    /// recipe is saved, to be resumed.
+    /// recipe is saved so that it can be resumed.
     ///
     /// # Errors
     /// When a file cannot be written or a held-out photograph cannot be read.
@@ -294,13 +294,13 @@ fn first_trainer(request: &TrainRequest, dataset: Arc<Dataset>, options: TrainOp
 /// Opens the device of this name; see [`TrainInput::device`](crate::TrainInput::device).
 ///
 /// # Errors
-/// When there is none of this name, or its driver refuses.
+/// When there is no device of this name, or its driver fails.
 pub fn open_device(name: &str) -> Result<Device, RunError> {
     let Ok(choice) = name.parse::<DeviceChoice>();
     Device::open(&choice).map_err(|error| RunError::setting("device", name, error.to_string()))
 }
 
-/// The trainer's options of the request, with the LPIPS network read.
+/// The trainer's options from the request; reads the LPIPS network and opens the device.
 fn train_options(request: &TrainRequest) -> Result<TrainOptions, RunError> {
     let input = &request.input;
     Ok(TrainOptions {

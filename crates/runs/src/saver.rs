@@ -1,6 +1,6 @@
-//! Writes checkpoints, large ones in the background: the training is held up while its splats are copied, and not while they are
-//! written. Most of a copy's time would be the system's, for fresh pages (with five million splats 4.8 of 5 s), so that its memory is
-//! obtained beforehand, in the background as well, and kept for the next one.
+//! Writes checkpoints, large ones in the background: training waits while its splats are copied, but not while they are written.
+//! The system would spend most of a copy's time on fresh pages (with five million splats 4.8 of 5 s), so the memory is obtained
+//! beforehand, also in the background, and kept for the next copy.
 
 use crate::RunFolder;
 use irradia_splat::SplatState;
@@ -10,10 +10,10 @@ use std::thread::JoinHandle;
 
 /// Copying is worth its memory for checkpoints of at least this many bytes: smaller ones are written in half a second.
 const BACKGROUND_FROM: u64 = 256 << 20;
-/// Splats for which memory is obtained, relative to those there are: density control adds some before the checkpoint.
+/// Number of splats for which memory is obtained, relative to the current number: density control adds some before the checkpoint.
 const ROOM: f64 = 1.25;
 
-/// Step and path of a checkpoint, or why there is none.
+/// Step and path of a checkpoint, or why it was not written.
 type Outcome = Result<(u64, String), String>;
 
 /// The writer of a run's checkpoints, at most one at a time. Dropping it waits for the last one.
@@ -21,14 +21,14 @@ type Outcome = Result<(u64, String), String>;
 pub(crate) struct Saver {
     writing: Option<JoinHandle<(Outcome, SplatState)>>,
     outcome: Option<Outcome>,
-    /// The memory of the next copy, if it is not being obtained.
+    /// The memory for the next copy, unless it is still being obtained.
     spare: SplatState,
     obtaining: Option<JoinHandle<SplatState>>,
 }
 
 impl Saver {
-    /// Obtains memory for a copy of `state`, of which there will be at most `most` splats, if checkpoints are to be written in the
-    /// background and there is none yet. Returns at once.
+    /// Obtains memory for a copy of `state`, which will have at most `most` splats, if checkpoints are to be written in the background
+    /// and there is none yet. Returns immediately.
     pub fn prepare(&mut self, state: &SplatState, most: usize) {
         let busy = self.writing.is_some() || self.obtaining.is_some();
         if busy || self.spare.has_room_for(state) || !copies(state.bytes() as u64, self.spare.bytes()) {
@@ -40,8 +40,8 @@ impl Saver {
         self.obtaining = Some(std::thread::spawn(move || SplatState::resident(len, degree)));
     }
 
-    /// Writes `checkpoint`. Returns its path, or nothing if it is still being written, from a copy: where it is large and memory
-    /// for the copy, for which [`memory::MemoryPlan`] leaves room, is free twice over.
+    /// Writes `checkpoint`. Returns its path, or `None` if it is still being written from a copy: this is the case if it is large and
+    /// twice the memory of the copy, for which [`memory::MemoryPlan`] leaves room, is free.
     ///
     /// # Errors
     /// One line.
@@ -125,7 +125,7 @@ impl Drop for Saver {
     }
 }
 
-/// Whether a state of `bytes` is copied, with `held` bytes there for the copy already.
+/// Whether a state of `bytes` is copied, if `held` bytes have already been obtained for the copy.
 fn copies(bytes: u64, held: usize) -> bool {
     let enough = |free: usize| (free + held) as u64 >= 2 * bytes;
     bytes >= BACKGROUND_FROM && memory::free().is_some_and(enough)

@@ -48,13 +48,13 @@ pub struct Scene {
     pub cameras: Option<Arc<[Camera]>>,
     /// From the coordinates of the dataset to those of `model` and `cameras`.
     pub world_from_dataset: Similarity,
-    /// What was left out when it was read, a line each.
+    /// What was left out when the scene was read, a line each.
     pub notes: Vec<String>,
 }
 
 impl Scene {
-    /// Reads a splat file, a field, or the scene of a run's folder. Background and antialiasing are those of the run that
-    /// contains the file, with the mean colour of its sky if it has one; a residual field beside a run's splats is part of the scene.
+    /// Reads a splat file, a field, or the scene in a run's folder. Background and antialiasing are those of the run that contains
+    /// the file; if the run has a sky, its mean colour is the background. A residual field beside a run's splats is part of the scene.
     ///
     /// # Errors
     /// When it cannot be read, or is a residual field without its splats.
@@ -75,7 +75,7 @@ impl Scene {
         })
     }
 
-    /// What is shown of a scene that is being edited.
+    /// The visible part of a scene that is being edited.
     pub fn of_draft(draft: &Draft, options: RenderOptions) -> Self {
         Self {
             model: Model::of_splats(Splats::from_cloud(&draft.shown())),
@@ -86,7 +86,7 @@ impl Scene {
         }
     }
 
-    /// `dataset`, whose files have the coordinates of the scene's, in the world of this scene.
+    /// Brings `dataset`, whose files use the same coordinates as the scene's dataset, into the world of this scene.
     pub fn place(&self, dataset: Dataset) -> Dataset {
         dataset.in_world(self.world_from_dataset)
     }
@@ -96,20 +96,20 @@ impl Scene {
         self.model.render(&mut Renderer::new(), camera, &self.options)
     }
 
-    /// `frames` cameras on a circle around the focus of the training cameras, at their mean distance and height, or there and back on the arc on
-    /// which these stand, where they leave a quarter of the circle or more; for a scene without them, around the centre of the splats. `size` is width and height in pixels; if `None`, that of the training
-    /// images, or 1280 x 720.
+    /// `frames` cameras on a circle around the focus of the training cameras, at their mean distance and height. If a quarter of the circle
+    /// or more has no training cameras, the path goes back and forth on the remaining arc. Without training cameras, the circle is around
+    /// the centre of the splats. `size` is width and height in pixels; if `None`, that of the training images, or 1280 x 720.
     pub fn orbit(&self, frames: u32, size: Option<(u32, u32)>) -> Vec<Camera> {
         orbit(self.model.splats(), self.cameras.as_deref(), frames, size)
     }
 
-    /// From where the scene is seen: its centre, up axis and extent.
+    /// Where the scene is viewed from: its centre, up axis and extent.
     pub fn outlook(&self) -> Outlook {
         outlook(self.model.splats(), self.cameras.as_deref())
     }
 }
 
-/// The file of the scene if `path` is a run's folder or one of SOG images, otherwise `path` itself.
+/// The scene's file if `path` is a run's folder or a folder of SOG images, otherwise `path` itself.
 pub fn scene_of(path: &Path) -> PathBuf {
     let files = [SCENE, FIELD].map(|name| path.join(name));
     let meta = is_sog_folder(path).then(|| path.join(SplatFormat::SogFolder.suffix()));
@@ -117,10 +117,10 @@ pub fn scene_of(path: &Path) -> PathBuf {
     found.or(meta).unwrap_or(path.to_owned())
 }
 
-/// Refuses an output that would replace the scene that is read.
+/// Rejects an output that would replace the input scene.
 ///
 /// # Errors
-/// When `output` is `scene`, or the file of the scene in it.
+/// When `output` is `scene`, or the scene's file in that folder.
 pub fn check_kept(scene: &Path, output: &Path) -> Result<(), RunError> {
     let scene = scene_of(scene);
     match same_file(output, &scene) {
@@ -132,7 +132,7 @@ pub fn check_kept(scene: &Path, output: &Path) -> Result<(), RunError> {
     }
 }
 
-/// Whether both paths lead to one file or folder that is there.
+/// Whether both paths lead to the same existing file or folder.
 pub(crate) fn same_file(a: &Path, b: &Path) -> bool {
     match (a.canonicalize(), b.canonicalize()) {
         (Ok(a), Ok(b)) => a == b,
@@ -149,12 +149,13 @@ pub(crate) fn read_field(path: &Path) -> Result<Field, RunError> {
     })
 }
 
-/// Whether `path` has the file name of a field.
+/// Whether `path` has the extension of a field's file.
 pub(crate) fn is_field(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension == "safetensors")
 }
 
-/// The model in a file: a field by its extension, otherwise splats; whether its opacities require antialiasing; its world; and what was left out.
+/// Returns the model in a file (a field if the extension says so, otherwise splats), whether its opacities require antialiasing, its
+/// world, and what was left out.
 fn read_model(path: &Path) -> Result<(Model<'static>, bool, Similarity, Vec<String>), RunError> {
     if is_field(path) {
         let field = read_field(path)?;
@@ -183,7 +184,7 @@ fn bytes_beside(scene: &Path, name: &str) -> Result<Option<Vec<u8>>, RunError> {
     beside(scene, name).map(read).transpose()
 }
 
-/// What `parse` finds in the file `name` beside the scene of a run, if there is one.
+/// The file `name` beside the scene of a run, if there is one, parsed by `parse`.
 fn parsed_beside<T>(
     scene: &Path,
     name: &str,
@@ -201,10 +202,11 @@ pub(crate) fn residual_beside(scene: &Path) -> Result<Option<Field>, RunError> {
     beside(scene, RESIDUAL).as_deref().map(read_field).transpose()
 }
 
-/// The light of each photograph of the dataset of the run whose scene is the file `scene`, if the run has learned it. The scene itself is in their mean.
+/// The light of each photograph of the run whose scene is the file `scene`, if the run has learned it. The scene itself is shown in
+/// the mean light.
 ///
 /// # Errors
-/// When a file of them cannot be read, or they do not belong together.
+/// When one of their files cannot be read, or the files do not belong together.
 pub fn read_lights(scene: &Path) -> Result<Option<Lights>, RunError> {
     let [exposures, appearance] = [bytes_beside(scene, EXPOSURES)?, bytes_beside(scene, APPEARANCE)?];
     Lights::from_files(exposures.as_deref(), appearance.as_deref()).map_err(|source| RunError::File {
@@ -213,7 +215,7 @@ pub fn read_lights(scene: &Path) -> Result<Option<Lights>, RunError> {
     })
 }
 
-/// What the lenses of the run whose scene is the file `scene` do to its photographs, if the run has learned it.
+/// The vignette of the lenses of the run whose scene is the file `scene`, if the run has learned it.
 ///
 /// # Errors
 /// When its file cannot be read.
@@ -226,7 +228,7 @@ fn sky_beside(scene: &Path) -> Result<Option<[f32; 3]>, RunError> {
     parsed_beside(scene, SKY, background_of_sky)
 }
 
-/// Background and antialiasing of the run that contains `scene`; otherwise the defaults.
+/// Background and antialiasing of the run that contains `scene`; the defaults if there is no run.
 pub(crate) fn render_knobs_beside(scene: &Path) -> RenderKnobs {
     let fallback = RenderKnobs {
         background: [0.0; 3],

@@ -33,9 +33,9 @@ pub struct Snapshot {
 #[derive(Default)]
 struct State {
     newest: Option<Arc<Snapshot>>,
-    /// Whether the training loop is running, and answers.
+    /// Whether the training loop is running and answers requests.
     running: bool,
-    /// Number of requests answered.
+    /// Number of answers published.
     answers: u64,
 }
 
@@ -62,8 +62,8 @@ impl Shared {
 pub struct Snapshots(Arc<Shared>);
 
 impl Snapshots {
-    /// The latest state: waits for the end of the current step while the training runs. Before the training runs there is
-    /// none; afterwards it is the final one.
+    /// The latest state; while the training runs, waits for the end of the current step. `None` before the training runs; the final
+    /// state afterwards.
     pub fn newest(&self) -> Option<Arc<Snapshot>> {
         let mut state = self.0.lock();
         let before = state.answers;
@@ -177,7 +177,7 @@ impl Observer for SnapshotServer {
 }
 
 impl Drop for SnapshotServer {
-    /// Releases threads that wait for a training that has ended, by a panic perhaps.
+    /// Releases threads that wait for a training that has ended, possibly by a panic.
     fn drop(&mut self) {
         self.stop();
     }

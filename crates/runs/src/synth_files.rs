@@ -4,7 +4,7 @@
 //! ```text
 //! transforms_train.json  transforms_val.json  transforms_test.json
 //! train/r_000.png ..     RGBA, 8 bits, opaque
-//! depth/train/r_000.png  16 bits: distance along the optical axis, or from the camera where the lens is wide, = value * depth_scale, world units
+//! depth/train/r_000.png  16 bits: distance along the optical axis (from the camera if the lens is wide) = value * depth_scale, world units
 //! normal/train/r_000.png 8 bits: world normal = value / 255 * 2 - 1, towards the camera
 //! points.ply             surface points with colours
 //! ```
@@ -21,9 +21,9 @@ use std::{fmt, fs};
 
 /// World units per step of the depth images: 16 bits reach 32.8 units, the demo's backdrop has its far side at 25.
 const DEPTH_SCALE: f32 = 0.0005;
-/// The same outdoors: they reach 655 units.
+/// The same for outdoor scenes: 16 bits reach 655 units.
 const DEPTH_SCALE_OUTDOOR: f32 = 0.01;
-/// Seconds in which photographs by moving cameras are read out; only its product with the velocities matters.
+/// Readout time of photographs by moving cameras, seconds; only its product with the velocities matters.
 const READOUT: f32 = 0.02;
 
 /// Summary of the dataset.
@@ -130,7 +130,7 @@ pub fn write_synth_dataset(out: impl AsRef<Path>, options: &SynthOptions) -> Res
     })
 }
 
-/// Picture, depth and normals of one view.
+/// Writes the photograph, depth and normals of one view.
 fn write_frame(out: &Path, name: &str, frame: &SynthFrame, depth_scale: f32) -> Result<(), RunError> {
     let (width, height) = (frame.color.width, frame.color.height);
     let step = |depth: &f32| (depth / depth_scale).round().clamp(0.0, 65535.0) as u16;

@@ -1,4 +1,4 @@
-//! Base64 (RFC 4648, section 4), for files that hold others as text.
+//! Base64 (RFC 4648, section 4), for files that contain other files as text.
 
 const ALPHABET: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
 

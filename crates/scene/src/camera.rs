@@ -1,7 +1,7 @@
 use crate::{Lens, Pose, RollingShutter};
 use glam::{DVec2, DVec3, Vec2, Vec3};
 
-/// A direction and that of its own pixel differ by less than this, radians, unless a lens folds.
+/// Maximum angle between a direction and that of its pixel, radians; it is larger only where a lens folds.
 const SAME_DIRECTION: f64 = 1e-3;
 
 /// Intrinsic parameters of a camera, in pixels.
@@ -19,7 +19,7 @@ pub struct Intrinsics {
     pub cx: f32,
     /// Principal point y, pixels; the image's top edge is 0.
     pub cy: f32,
-    /// Distortion; [`Lens::Pinhole`] unless photographs are kept as their lens shows them, since readers undistort them.
+    /// Distortion; [`Lens::Pinhole`] unless photographs are kept distorted, since readers undistort them by default.
     pub lens: Lens,
 }
 
@@ -61,7 +61,7 @@ impl Intrinsics {
         }
     }
 
-    /// The point of the lens's plane at a position in the image, pixels.
+    /// The point on the lens's plane at a position in the image, pixels.
     pub fn plane_of(&self, pixel: DVec2) -> DVec2 {
         let [fx, fy, cx, cy] = [self.fx, self.fy, self.cx, self.cy].map(f64::from);
         DVec2::new((pixel.x - cx) / fx, (pixel.y - cy) / fy)
@@ -73,7 +73,8 @@ impl Intrinsics {
         DVec2::new(fx * plane.x + cx, fy * plane.y + cy)
     }
 
-    /// Pixel coordinates of a point in the camera and its [depth](Self::depth); `None` where the lens shows nothing, such as behind a pinhole.
+    /// Pixel coordinates and [depth](Self::depth) of a point in camera space; `None` where the lens shows nothing, such as behind a
+    /// pinhole.
     pub fn project(&self, point: Vec3) -> Option<(Vec2, f32)> {
         let depth = self.depth(point);
         if self.lens == Lens::Pinhole {
@@ -85,18 +86,19 @@ impl Intrinsics {
         }
         let direction = point.as_dvec3();
         let plane = self.lens.project(direction)?;
-        // Beyond the fold of a polynomial another direction has the same pixel.
+        // Beyond the fold of a polynomial, another direction has the same pixel.
         let back = self.lens.direction(plane)?;
         let is_same = back.angle_between(direction) < SAME_DIRECTION;
         is_same.then(|| (self.pixel_of(plane).as_vec2(), depth))
     }
 
-    /// The depth of a point in the camera: along +Z, or for lenses that also show what is behind the camera the distance from it.
+    /// The depth of a point in camera space: along +Z, or, for lenses that also see behind the camera, the distance from the camera.
     pub fn depth(&self, point: Vec3) -> f32 {
         if self.lens.is_wide() { point.length() } else { point.z }
     }
 
-    /// The point in the camera that pixel coordinates `(x, y)` show at a [depth](Self::depth) of 1; straight ahead where the lens shows nothing.
+    /// The point in camera space that is seen at pixel coordinates `(x, y)` and a [depth](Self::depth) of 1; straight ahead where the
+    /// lens shows nothing.
     pub fn ray(&self, pixel: Vec2) -> Vec3 {
         if self.lens == Lens::Pinhole {
             return Vec3::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy, 1.0);
@@ -125,7 +127,7 @@ pub struct Camera {
     pub intrinsics: Intrinsics,
     /// Near plane: nothing at a smaller [depth](Intrinsics::depth) is drawn, world units.
     pub near: f32,
-    /// How it moves during the exposure of a photograph; `None` if it does not.
+    /// Its motion during the readout of a photograph; `None` if it is at rest.
     pub shutter: Option<RollingShutter>,
 }
 
@@ -148,7 +150,8 @@ impl Camera {
         self.intrinsics.lens == Lens::Pinhole && self.shutter.is_none()
     }
 
-    /// Pixel coordinates of a world point and its [depth](Intrinsics::depth); `None` in front of the near plane and where the lens shows nothing.
+    /// Pixel coordinates of a world point and its [depth](Intrinsics::depth); `None` closer than the near plane and where the lens
+    /// shows nothing.
     pub fn project(&self, world: Vec3) -> Option<(Vec2, f32)> {
         let (point, k) = (self.pose.camera_from_world(world), &self.intrinsics);
         let projected = match &self.shutter {
@@ -162,15 +165,15 @@ impl Camera {
         projected.filter(|(_, depth)| *depth > self.near)
     }
 
-    /// As [`Self::project`], but `None` outside the image as well; what may hide the point is ignored.
+    /// Like [`Self::project`], but `None` outside the image as well; occlusion is ignored.
     pub fn sees(&self, world: Vec3) -> Option<(Vec2, f32)> {
         let k = &self.intrinsics;
         self.project(world)
             .filter(|(at, _)| (0.0..k.width as f32).contains(&at.x) && (0.0..k.height as f32).contains(&at.y))
     }
 
-    /// The ray through pixel coordinates `(x, y)`: a point of it and its unit direction, in the world. It goes straight ahead where the lens shows
-    /// nothing.
+    /// The ray through pixel coordinates `(x, y)`: a point on it and its unit direction, in the world. It goes straight ahead where the
+    /// lens shows nothing.
     pub fn ray(&self, pixel: Vec2) -> (Vec3, Vec3) {
         let (k, ray) = (&self.intrinsics, self.intrinsics.ray(pixel));
         let (from, along) = match &self.shutter {

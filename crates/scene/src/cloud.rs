@@ -20,7 +20,7 @@ pub struct GaussianCloud {
     pub antialiased: bool,
     /// From the coordinates of the dataset, in which files are written, to those of `means` and `log_scales`.
     pub world_from_dataset: Similarity,
-    /// What the file has beyond that for each splat, `[N]` each, names differing.
+    /// Further values that the file has for each splat, `[N]` each, with distinct names.
     pub extra: Vec<ExtraColumn>,
 }
 
@@ -50,7 +50,7 @@ impl GaussianCloud {
             && self.extra.iter().all(|column| column.len() == n)
     }
 
-    /// Gives harmonics of `degree`: higher bands are dropped, new ones are zero.
+    /// Sets the degree of the harmonics: higher bands are dropped, new ones are zero.
     pub fn set_degree(&mut self, degree: u32) {
         if self.sh_degree == degree {
             return;

@@ -86,7 +86,7 @@ pub trait PhotoSource: Send + Sync {
     /// One line that names the file and the remedy.
     fn load(&self) -> Result<Photo, LoadError>;
 
-    /// The photograph at `width` x `height`, at most those of [`Self::load`].
+    /// The photograph at `width` x `height`, which are at most those of [`Self::load`].
     ///
     /// # Errors
     /// Those of [`Self::load`].
@@ -113,7 +113,7 @@ pub struct Kept {
 }
 
 impl Kept {
-    /// Nothing is loaded yet.
+    /// Keeps the photograph of `source`, which is not loaded yet.
     pub fn new(source: Arc<dyn PhotoSource>) -> Self {
         Self {
             source,
@@ -153,7 +153,7 @@ impl PhotoSource for Photo {
     }
 }
 
-/// What was measured or estimated at each place of a photograph and given beside it, on a regular grid over the view.
+/// Values that were measured or estimated all over a photograph and come with it, on a regular grid over the view.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Grid<T> {
     /// Cells from left to right.
@@ -181,7 +181,7 @@ impl<T> Grid<T> {
 /// Depth along +Z, or its inverse, up to scale and shift. Unknown where it is not positive and finite.
 pub type DepthGrid = Grid<f32>;
 
-/// Normals as their file has them, each coordinate in \[-1, 1\]. Unknown where they are shorter than a half.
+/// Normals as stored in their file, each coordinate in \[-1, 1\]. Unknown where they are shorter than a half.
 pub type NormalGrid = Grid<[f32; 3]>;
 
 /// A source of a grid: a file, or values in memory.
@@ -213,17 +213,17 @@ pub struct View {
     /// Capture time, in the source's own unit (0 to 1 over the capture where transforms.json follows D-NeRF); `None` if the
     /// source has none.
     pub time: Option<f32>,
-    /// Indices into [`Dataset::points`] of the points visible in this view, as the source lists them or as they hide one another; empty if
-    /// neither is known.
+    /// Indices into [`Dataset::points`] of the points visible in this view, as listed by the source or computed from their occlusion; empty
+    /// if neither is known.
     pub points_seen: Vec<u32>,
-    /// Depths of all that the view shows, measured or estimated, if they were given.
+    /// Depth map of the view, measured or estimated, if one was given.
     pub depth_map: Option<Arc<dyn GridSource<f32>>>,
-    /// Normals of all that the view shows, if they were given.
+    /// Normal map of the view, if one was given.
     pub normal_map: Option<Arc<dyn GridSource<[f32; 3]>>>,
 }
 
 impl View {
-    /// A view of which nothing else is known.
+    /// A view without optional data.
     pub fn new(name: impl Into<String>, camera: Camera, photo: Arc<dyn PhotoSource>) -> Self {
         Self {
             name: name.into(),

@@ -1,4 +1,4 @@
-//! Values that a file has for each splat beyond those that are rendered, kept for the next file.
+//! Values that a file has for each splat but that are not rendered, kept for the next file.
 
 /// The type of a number in a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -22,7 +22,7 @@ pub enum Scalar {
 }
 
 impl Scalar {
-    /// Bytes of a number.
+    /// Number of bytes.
     pub fn size(self) -> usize {
         match self {
             Self::I8 | Self::U8 => 1,
@@ -32,13 +32,13 @@ impl Scalar {
         }
     }
 
-    /// Whether it has a fraction.
+    /// Whether it is a floating-point type.
     pub fn is_float(self) -> bool {
         matches!(self, Self::F32 | Self::F64)
     }
 }
 
-/// A number for each splat that has a meaning only for the program that wrote it.
+/// A number for each splat that has a meaning only to the program that wrote it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ExtraColumn {
     /// Its name in the file.
@@ -59,12 +59,12 @@ impl ExtraColumn {
         }
     }
 
-    /// Numbers in it.
+    /// Number of values.
     pub fn len(&self) -> usize {
         self.bytes.len() / self.scalar.size()
     }
 
-    /// Whether it has no numbers.
+    /// Whether it has no values.
     pub fn is_empty(&self) -> bool {
         self.bytes.is_empty()
     }
@@ -83,7 +83,7 @@ impl ExtraColumn {
         }
     }
 
-    /// Writes the numbers of `from` over the numbers `indices`.
+    /// Overwrites the numbers `indices` with those of `from`.
     pub fn scatter(&mut self, indices: &[u32], from: &Self) {
         let size = self.scalar.size();
         for (row, i) in indices.iter().enumerate() {
@@ -91,7 +91,7 @@ impl ExtraColumn {
         }
     }
 
-    /// Appends the numbers of the column of `others` that has its name and type, or zeros; `count` in any case.
+    /// Appends `count` numbers: those of the column of `others` with the same name and type, or zeros if there is none.
     pub fn append(&mut self, others: &[Self], count: usize) {
         match others.iter().find(|other| self.is_like(other)) {
             Some(other) => self.bytes.extend_from_slice(&other.bytes),

@@ -1,6 +1,6 @@
 //! IEEE 754 half-precision numbers as their bits.
 
-/// The nearest half-precision number, ties to even; beyond its range the largest one. NaN stays NaN.
+/// The nearest half-precision number, ties to even; values beyond the range become the largest one. NaN stays NaN.
 pub fn half(value: f32) -> u16 {
     let bits = value.to_bits();
     let sign = (bits >> 16 & 0x8000) as u16;

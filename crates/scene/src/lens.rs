@@ -1,8 +1,8 @@
 use glam::{DVec2, DVec3};
 use std::f64::consts::PI;
 
-/// The mapping of a lens from directions to its plane, in COLMAP's and OpenCV's parameters. A pixel is `(fx, fy)` times a point of the plane
-/// plus the principal point.
+/// The mapping of a lens from directions to its plane, in COLMAP's and OpenCV's parameters. A pixel is `(fx, fy)` times a point of the
+/// plane plus the principal point.
 ///
 /// Directions are those of the OpenCV camera: x right, y down, z forward.
 #[derive(Clone, Copy, Debug, PartialEq, Default)]
@@ -17,8 +17,8 @@ pub enum Lens {
         /// Tangential coefficients p1, p2.
         p: [f64; 2],
     },
-    /// OpenCV's fisheye model (Kannala and Brandt 2006; COLMAP `OPENCV_FISHEYE`), `theta_d = theta (1 + k1 theta^2 + ..)`, and with what COLMAP's
-    /// `THIN_PRISM_FISHEYE` adds.
+    /// OpenCV's fisheye model (Kannala and Brandt 2006; COLMAP `OPENCV_FISHEYE`), `theta_d = theta (1 + k1 theta^2 + ..)`, with the terms
+    /// that COLMAP's `THIN_PRISM_FISHEYE` adds.
     Fisheye {
         /// Radial coefficients k1..k4.
         k: [f64; 4],
@@ -46,7 +46,7 @@ impl Lens {
         }
     }
 
-    /// Whether the lens can show more than what is before the camera.
+    /// Whether the lens can also see behind the camera.
     pub fn is_wide(&self) -> bool {
         matches!(self, Lens::Fisheye { .. } | Lens::Equirectangular)
     }
@@ -60,8 +60,8 @@ impl Lens {
         }
     }
 
-    /// The radius on the undistorted plane, at most `largest`, up to which the lens is monotonic, infinite if it is on all of it. Beyond it a polynomial
-    /// folds back and would show the picture twice.
+    /// The radius on the undistorted plane, at most `largest`, up to which the lens is monotonic; infinite if it is monotonic all the way.
+    /// Beyond it a polynomial folds back and would show the image twice.
     pub fn reach_on_plane(&self, largest: f64) -> f64 {
         if *self == Lens::Pinhole {
             return f64::INFINITY;
@@ -78,8 +78,8 @@ impl Lens {
         }
     }
 
-    /// The distance from the centre, on the lens's plane, of what is `theta` radians from the axis; NaN where the lens has nothing. Its tangential
-    /// part is ignored.
+    /// The distance from the centre, on the lens's plane, of a direction `theta` radians from the axis; NaN where the lens shows nothing.
+    /// Its tangential part is ignored.
     pub fn radius_of_angle(&self, theta: f64) -> f64 {
         let point = self.radial().project(DVec3::new(theta.sin(), 0.0, theta.cos()));
         point.map_or(f64::NAN, |point| point.x)
@@ -96,8 +96,8 @@ impl Lens {
         }
     }
 
-    /// The plane's point of a direction of any length; `None` where the lens has none: behind the camera, except for wide lenses, which
-    /// lack at most the direction straight behind.
+    /// The point on the plane of a direction of any length; `None` where the lens has none: behind the camera, or, for wide lenses, at most
+    /// straight behind it.
     pub fn project(&self, direction: DVec3) -> Option<DVec2> {
         let DVec3 { x, y, z } = direction;
         match self {
@@ -135,16 +135,16 @@ impl Lens {
 
     /// Maps a point of the undistorted plane `(X / Z, Y / Z)` to the lens's plane.
     pub fn distort(&self, p: DVec2) -> DVec2 {
-        self.project(p.extend(1.0)).expect("it is before the camera")
+        self.project(p.extend(1.0)).expect("it is in front of the camera")
     }
 
-    /// The inverse of [`Lens::distort`]; `None` where [`Lens::direction`] has none, or one that is not before the camera.
+    /// The inverse of [`Lens::distort`]; `None` where [`Lens::direction`] has none, or one that is not in front of the camera.
     pub fn undistort(&self, distorted: DVec2) -> Option<DVec2> {
         let direction = self.direction(distorted)?;
         (direction.z > 0.0).then(|| direction.truncate() / direction.z)
     }
 
-    /// The distortion on the plane on which the model defines it: of equal angles for fisheyes, else the undistorted plane.
+    /// The distortion on the plane on which the model defines it: that of equal angles for fisheyes, otherwise the undistorted plane.
     fn bend(&self, p: DVec2) -> DVec2 {
         let (x, y) = (p.x, p.y);
         let r2 = p.length_squared();
@@ -203,7 +203,7 @@ impl Lens {
     }
 }
 
-/// The largest of values up to `largest` up to which `of` grows; `None` if it always does.
+/// The value, at most `largest`, up to which `of` increases; `None` if it increases all the way.
 fn monotonic(largest: f64, of: impl Fn(f64) -> f64) -> Option<f64> {
     const STEPS: u32 = 2000;
     let mut before = 0.0;
@@ -261,8 +261,8 @@ mod tests {
         assert_eq!(LENSES[2].project(DVec3::NEG_Z), None);
     }
 
-    /// Pixels of focal lengths (100, 110) and principal point (200, 150), by COLMAP 4.2.1 (`pycolmap`, `Camera.img_from_cam`); for the panorama of
-    /// 400 x 300 pixels.
+    /// Pixels by COLMAP 4.2.1 (`pycolmap`, `Camera.img_from_cam`), for focal lengths (100, 110) and principal point (200, 150), and for a
+    /// panorama of 400 x 300 pixels.
     #[test]
     fn points_are_where_colmap_has_them() {
         let directions = [DVec3::new(0.3, -0.2, 1.0), DVec3::new(-0.9, 0.7, 0.6)];

@@ -2,7 +2,8 @@
 //!
 //! Nothing here reads a file or runs a kernel. Every other crate follows these conventions:
 //!
-//! - World: right-handed, in the dataset's own coordinates unless [`Dataset::world_from_dataset`] moves and scales them. Cameras: OpenCV axes, +X right, +Y down, +Z forward.
+//! - World: right-handed, in the dataset's own coordinates unless [`Dataset::world_from_dataset`] moves and scales them. Cameras: OpenCV
+//!   axes, +X right, +Y down, +Z forward.
 //! - Transforms are named target-from-source: [`Pose::world_from_camera`].
 //! - The centre of pixel (0, 0) is at (0.5, 0.5). Colour is sRGB-encoded float in \[0, 1\]. Angles in radians.
 //! - Quaternions are `w, x, y, z`, normalised when used. Scales are stored as ln, opacities as logit.

@@ -28,7 +28,7 @@ impl Part {
     }
 }
 
-/// As [`resize_area`], of a part of the pixels.
+/// Like [`resize_area`], but of a part of the image.
 ///
 /// # Panics
 /// As [`resize_area`].
@@ -112,7 +112,7 @@ impl Span {
     }
 }
 
-/// Of `to` output pixels over `length` of `from` source pixels, beginning at `begin`.
+/// The spans of `to` output pixels, which cover `length` of the `from` source pixels, starting at `begin`.
 fn spans(from: u32, begin: f64, length: f64, to: u32) -> Vec<Span> {
     let scale = length / f64::from(to);
     (0..to)

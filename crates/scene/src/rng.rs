@@ -1,4 +1,4 @@
-//! The project's random number generator: small, seedable, and its state is two words, which a checkpoint can store.
+//! The project's random number generator: small and seedable, with a state of two words, which a checkpoint can store.
 
 /// PCG-XSH-RR 64/32 (O'Neill 2014).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -30,7 +30,7 @@ impl Rng {
         xorshifted.rotate_right((old >> 59) as u32)
     }
 
-    /// Skips `count` draws of 32 bits, in logarithmic time (Brown 1994): threads begin in the middle of one sequence.
+    /// Skips `count` draws of 32 bits in logarithmic time (Brown 1994), so that threads can start in the middle of one sequence.
     pub fn advance(&mut self, mut count: u64) {
         let (mut factor, mut summand) = (6_364_136_223_846_793_005u64, self.stream);
         let (mut total_factor, mut total_summand) = (1u64, 0u64);

@@ -4,8 +4,8 @@ use glam::{Vec2, Vec3};
 use std::fmt;
 use std::str::FromStr;
 
-/// The side of a picture that is exposed first. Phones read their sensor along the short side of a picture: from the top of one in landscape format,
-/// from the left or the right of one in portrait format.
+/// The side of a photograph that is exposed first. Phones read out their sensor along the short side of a photograph: from the top in
+/// landscape format, from the left or the right in portrait format.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[allow(missing_docs)]
 pub enum FirstSide {
@@ -56,39 +56,40 @@ impl FromStr for FirstSide {
     }
 }
 
-/// How a camera moves while a photograph is read out (rolling shutter), to first order: a point `p` in the camera of the middle row is at
-/// `p - t (translation + rotation x p)` in the camera of time `t`, which is -0.5 at the first row and 0.5 after the last (Seiskari et al. 2024,
-/// "Gaussian Splatting on the Move").
+/// How a camera moves while a photograph is read out (rolling shutter), to first order: a point `p` in the camera space of the middle row
+/// is at `p - t (translation + rotation x p)` in the camera space of time `t`, which is -0.5 at the first row and 0.5 after the last
+/// (Seiskari et al. 2024, "Gaussian Splatting on the Move").
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RollingShutter {
-    /// Where the readout begins.
+    /// The side at which the readout begins.
     pub first: FirstSide,
-    /// The way of the camera during the readout, along its own axes, world units.
+    /// Translation of the camera during the readout, along its own axes, world units.
     pub translation: Vec3,
-    /// Its turn during the readout, axis times angle about its own axes, radians.
+    /// Rotation of the camera during the readout, axis times angle about its own axes, radians.
     pub rotation: Vec3,
 }
 
 impl RollingShutter {
-    /// Rounds in which the time at which a point is seen is found: it depends on the row, which depends on the time. Each round divides the error by
-    /// the ratio of the readout's speed to the picture's, which is 10 and more.
+    /// Number of iterations that find the time at which a point is seen: it depends on the row, which depends on the time. Each iteration
+    /// divides the error by the ratio of the readout's speed to that of the point in the image, which is 10 or more.
     pub const ROUNDS: usize = 4;
-    /// Radians by which a camera may turn during a readout: a first-order model is far off before.
+    /// Maximum turn of a camera during a readout, radians; a first-order model is far off well below it.
     pub const MOST_TURNED: f32 = 0.5;
 
-    /// When a position in an image of `size` pixels is exposed.
+    /// The time at which a position in an image of `size` pixels is exposed, -0.5 to 0.5.
     pub fn time(&self, pixel: Vec2, size: [u32; 2]) -> f32 {
         let axis = self.first.axis();
         let along = pixel[axis] / size[axis] as f32 - 0.5;
         if self.first.is_reversed() { -along } else { along }
     }
 
-    /// Where `point`, in the camera of the middle row, is in that of `time`.
+    /// Transforms `point` from the camera space of the middle row to that of `time`.
     pub fn at(&self, point: Vec3, time: f32) -> Vec3 {
         point - time * (self.translation + self.rotation.cross(point))
     }
 
-    /// The line, in the camera of the middle row, of the points `k` times `ray` in that of `time`: a point on it, and what `k` is multiplied by.
+    /// The line, in the camera space of the middle row, of the points `k ray` in that of `time`: its start and its direction, by which
+    /// `k` is multiplied.
     pub fn line(&self, ray: Vec3, time: f32) -> (Vec3, Vec3) {
         let turn = time * self.rotation;
         // The inverse of p - turn x p.
@@ -96,7 +97,7 @@ impl RollingShutter {
         (back(time * self.translation), back(ray))
     }
 
-    /// Where a point is seen whose pixel at a time is `project`.
+    /// The pixel at which a point is seen, given its pixel `project(time)` at any time.
     pub(crate) fn seen(&self, size: [u32; 2], project: impl Fn(f32) -> Option<Vec2>) -> Option<Vec2> {
         let mut found = project(0.0)?;
         for _ in 0..Self::ROUNDS {

@@ -1,4 +1,4 @@
-//! Maps features and matches from one file and writes the poses, to compare with other programs:
+//! Maps features and matches from a file and writes the poses, for comparison with other programs:
 //! `map_matches MATCHES [POSES]`. All numbers are little-endian: u32 photographs; each: u32 length and bytes of the name, u32
 //! width, u32 height, f64 focal length or 0, u32 keypoints, each f32 x, y, scale, angle; u32 pairs; each: u32 first, second,
 //! matches, each u32 keypoint of the first and of the second.

@@ -1,27 +1,32 @@
-//! A plain backdrop behind what turns, in light that changes a little: [`StillScene`](crate::StillScene) needs texture to tell what stands still.
+//! A plain backdrop behind an object that turns, under slightly changing light: [`StillScene`](crate::StillScene) needs texture to
+//! detect what stands still.
 //!
-//! Only for pictures of a camera that is known to be at rest: white paper looks the same to a camera that moves.
+//! Only for photographs from a camera that is known to be at rest: white paper looks the same to a moving camera.
 
 use crate::connected;
 use crate::still_scene::{adjacent, channel, means, samples, variance};
 use rayon::prelude::*;
 
-/// Largest difference of a channel's mean around a pixel, of 255, of the same backdrop in other light: the white balance of a telephone, shadows of what turns.
+/// Maximum difference of a channel's mean around a pixel, of 255, for the same backdrop in other light: the white balance of a phone,
+/// shadows of what turns.
 const SHADE: f32 = 30.0;
-/// Largest standard deviation of a channel around a pixel of what is plain, of 255.
+/// Maximum standard deviation of a channel around a pixel in a plain area, of 255.
 const PLAIN: f32 = 3.0;
-/// Rounds in which the light of a picture is found.
+/// Number of rounds in which the light of a photograph is estimated.
 const ROUNDS: usize = 3;
-/// Pixels by which a passage from the border must be wider than twice: what turns touches the backdrop in single ones.
+/// Half the minimum width of a passage from the border, px: what turns merges with the backdrop in single pixels.
 const PASSAGE: usize = 3;
-/// Pixels by which what looks the same in most pictures must be wider than twice to turn all the same, such as a vase: else it is a line behind, such as the rim of the plate.
+/// Half the minimum width, px, of what looks the same in most photographs and turns nevertheless, such as a vase: anything thinner is
+/// a line in the background, such as the rim of the plate.
 const THIN: usize = 7;
-/// Variance of the difference to it, by that of the picture, of an edge behind: a camera at rest moves by a fraction of a pixel.
+/// Maximum variance of the difference from the backdrop, relative to that of the photograph, at an edge in the background: a camera at
+/// rest moves by a fraction of a pixel.
 const ALIKE: f32 = 0.25;
-/// The largest region that hides the backdrop, by one up to which another is a part of it: the edge of the paper.
+/// A region in front of the backdrop that is this many times smaller than the largest one is part of the backdrop, such as the edge of
+/// the paper.
 const SPECK: usize = 20;
 
-/// What most pictures of a camera show at each pixel.
+/// What most photographs from a camera show at each pixel.
 pub struct Backdrop {
     width: usize,
     /// `[3][H, W]` of 255.
@@ -29,10 +34,10 @@ pub struct Backdrop {
 }
 
 impl Backdrop {
-    /// That of `pictures`, `[H, W, 3]`.
+    /// The backdrop of `pictures`, `[H, W, 3]`: their median.
     ///
     /// # Panics
-    /// When there is no picture, or one has not `width * height` pixels.
+    /// When there is no picture, or one does not have `width * height` pixels.
     pub fn of(width: usize, height: usize, pictures: &[impl AsRef<[u8]>]) -> Self {
         let samples = samples(width, height, pictures);
         let median = |at: usize| {
@@ -46,7 +51,7 @@ impl Backdrop {
         }
     }
 
-    /// `[H, W]` where `picture`, `[H, W, 3]`, shows it: what is plain, of its colour and joined to the border.
+    /// `[H, W]` whether `picture`, `[H, W, 3]`, shows the backdrop: areas that are plain, of its colour and connected to the border.
     ///
     /// # Panics
     /// When the picture has another size.
@@ -74,7 +79,7 @@ impl Backdrop {
         let thick = self.spread(self.spread(hides, THIN, false), THIN, true);
         let is_line = |at: usize| is_alike(at, plain.max(ALIKE * texture[at])) && !thick[at] && !shown[at];
         let lines: Vec<bool> = (0..shown.len()).map(is_line).collect();
-        // A stem that looks the same from all sides ends within the picture.
+        // A line that reaches the border is in the background: a stem that looks the same from all sides ends inside the photograph.
         for line in self.regions(&lines) {
             let leads_out = lines[line[0]] && line.iter().any(|at| self.is_border(*at));
             line.into_iter().for_each(|at| shown[at] |= leads_out);
@@ -88,13 +93,13 @@ impl Backdrop {
         shown
     }
 
-    /// The fraction of the border of a picture that is `shown`.
+    /// The fraction of a photograph's border where the backdrop is `shown`.
     pub fn surrounds(&self, shown: &[bool]) -> f64 {
         let border = || (0..shown.len()).filter(|at| self.is_border(*at));
         border().filter(|at| shown[*at]).count() as f64 / border().count().max(1) as f64
     }
 
-    /// How far its colour ranges where it is `shown`, of 255, without the outermost twentieths: the largest of the channels.
+    /// Range of the backdrop's colour where it is `shown`, of 255, without the lowest and highest twentieth: the maximum over the channels.
     pub fn range(&self, shown: &[bool]) -> f32 {
         let range = |color: &Vec<f32>| {
             let mut values: Vec<f32> = color.iter().zip(shown).filter(|v| *v.1).map(|v| *v.0).collect();
@@ -107,7 +112,7 @@ impl Backdrop {
         self.color.iter().map(range).fold(0.0, f32::max)
     }
 
-    /// How much brighter than here each channel of a picture is.
+    /// Brightness of each channel of a photograph relative to the backdrop.
     fn light(&self, color: &[Vec<f32>; 3]) -> [f32; 3] {
         let mut light = [0, 1, 2].map(|c| {
             let both = color[c].iter().zip(&self.color[c]);
@@ -132,7 +137,7 @@ impl Backdrop {
         light
     }
 
-    /// Pixels of `shown`, and those up to `pixels` beside them if it `grows`; else only those with all of these.
+    /// Dilates `shown` by `pixels` if it `grows`, else erodes it by `pixels`.
     fn spread(&self, mut shown: Vec<bool>, pixels: usize, grows: bool) -> Vec<bool> {
         for _ in 0..pixels {
             let beside = |at: usize| adjacent(self.width, shown.len(), at);
@@ -145,7 +150,7 @@ impl Backdrop {
         shown
     }
 
-    /// Connected pixels that all are `shown`, or all are not; the largest first.
+    /// Connected regions of pixels that are all `shown` or all not `shown`, largest first.
     fn regions(&self, shown: &[bool]) -> Vec<Vec<usize>> {
         let alike = |at: usize| adjacent(self.width, shown.len(), at).filter(move |to| shown[*to] == shown[at]);
         connected(shown.len(), alike)
@@ -163,7 +168,8 @@ mod tests {
 
     const SIZE: [usize; 2] = [64, 48];
 
-    /// A striped box whose left edge is at `left`, before paper that gets darker to the right, in a light; its core has the colour of the paper.
+    /// A striped box whose left edge is at `left`, in front of paper that gets darker to the right, with the brightness `light`; its core
+    /// has the colour of the paper.
     fn picture(left: usize, light: f32) -> Vec<u8> {
         let pixel = |i: usize| {
             let (x, y) = (i % SIZE[0], i / SIZE[0]);
@@ -205,7 +211,7 @@ mod tests {
         let shown = Backdrop::of(SIZE[0], SIZE[1], &pictures).shown(&pictures[5]);
         let at = |x: usize, y: usize| shown[y * SIZE[0] + x];
         assert!(at(2, 24) && at(8, 24) && at(9, 40) && at(14, 24));
-        // Five of six pictures show the box there.
+        // Five of six photographs show the box there.
         assert!(!at(38, 15));
     }
 

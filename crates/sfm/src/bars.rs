@@ -1,19 +1,20 @@
-//! Bars at the borders of pictures: those of a film that was fitted into a frame of another shape.
+//! Bars at the borders of photographs: letterboxing and pillarboxing of a film that was fitted into a frame of another shape.
 
 use crate::median;
 
-/// Distance from the bar's colour of a pixel of it, of 255, in each channel, at most.
+/// Maximum difference of a bar's pixel from the bar's colour in each channel, of 255.
 const TOLERANCE: f64 = 12.0;
-/// Part of a line's pixels that a bar has, in every picture.
+/// Minimum fraction of a line's pixels that have the bar's colour, in every photograph.
 const PLAIN: f64 = 0.99;
-/// Part that the line behind its edge has, in half of the pictures, at most: what is dark or empty of its own ends elsewhere in each.
+/// Maximum such fraction of the line behind the bar's edge, in at least half of the photographs: dark or empty parts of the scene
+/// end elsewhere in each photograph.
 const BEHIND: f64 = 0.5;
 /// Lines over which the edge of a bar is blurred, by scaling and by compression.
 const BLURRED: usize = 3;
-/// Lines of a bar, by the longer side, at least.
+/// Minimum width of a bar, relative to the longer side.
 const LEAST: f64 = 0.006;
 
-/// Widths of the bars to the left, above, to the right and below, px, in `pictures`, `[H, W, 3]`; 0 where there is none.
+/// Widths of the left, top, right and bottom bars of `pictures`, `[H, W, 3]`, px; 0 where there is no bar.
 pub fn bars(width: usize, height: usize, pictures: &[&Vec<u8>]) -> [usize; 4] {
     let least = (LEAST * width.max(height) as f64).ceil() as usize;
     [0, 1, 2, 3].map(|side| {
@@ -57,7 +58,7 @@ pub fn bars(width: usize, height: usize, pictures: &[&Vec<u8>]) -> [usize; 4] {
 mod tests {
     use super::*;
 
-    /// Pictures of 100 x 80 with a pattern that differs, `dark` px of it black from the left.
+    /// Photographs of 100 x 80 px, each with its own pattern, whose leftmost `dark` px are black.
     fn pictures(dark: impl Fn(usize) -> usize) -> Vec<Vec<u8>> {
         let picture = |i: usize| {
             let pixel = |at: usize| {
@@ -82,7 +83,7 @@ mod tests {
     fn bars_end_at_the_same_line_in_all_pictures() {
         assert_eq!(found(|_| 20), [20, 0, 0, 0]);
         assert_eq!(found(|_| 0), [0; 4]);
-        // Darkness that ends elsewhere in each picture, and a bar in some of them only.
+        // A dark part that ends elsewhere in each photograph, and a bar in only some of them.
         assert_eq!(found(|i| 20 + 8 * i), [0; 4]);
         assert_eq!(found(|i| 20 * (i % 2)), [0; 4]);
     }

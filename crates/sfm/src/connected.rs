@@ -1,6 +1,6 @@
-//! Photographs that links join.
+//! Connected components.
 
-/// The parts of `count` photographs that links join, largest first, each ascending.
+/// The connected components of `count` items, such as photographs or pixels, largest first, each ascending.
 pub(crate) fn connected<L: Iterator<Item = usize>>(count: usize, linked: impl Fn(usize) -> L) -> Vec<Vec<usize>> {
     let mut reached = vec![false; count];
     let mut parts: Vec<Vec<usize>> = Vec::new();

@@ -3,7 +3,7 @@ use glam::DVec2;
 /// Bytes of a descriptor: 4 x 4 cells of 8 orientations.
 pub const DESCRIPTOR_BYTES: usize = 128;
 
-/// One feature's place in a photograph.
+/// The position, scale and direction of a feature in a photograph.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Keypoint {
     /// Column, pixels of the photograph at full size; the first pixel's centre is at 0.5.
@@ -17,7 +17,7 @@ pub struct Keypoint {
 }
 
 impl Keypoint {
-    /// Its place, pixels.
+    /// Its position, pixels.
     pub fn at(&self) -> DVec2 {
         DVec2::new(self.x.into(), self.y.into())
     }
@@ -30,12 +30,12 @@ pub struct Features {
     pub keypoints: Vec<Keypoint>,
     /// `[N, 128]` RootSIFT, bytes: 512 times the square root of the L1-normalised histogram, at most 255.
     pub descriptors: Vec<[u8; DESCRIPTOR_BYTES]>,
-    /// `[N, 128]` of the same kind, of each feature's surroundings as they look from the front, whatever the tilt; empty unless the extractor was asked for
-    /// them.
+    /// `[N, 128]` descriptors of the same kind, of each feature's surroundings rectified to a frontal view; empty unless the extractor was
+    /// configured to compute them.
     pub frontal: Vec<[u8; DESCRIPTOR_BYTES]>,
 }
 
-/// The descriptor of what has none: it matches nothing.
+/// Stands for a missing descriptor: it matches nothing.
 pub(crate) const NO_DESCRIPTOR: [u8; DESCRIPTOR_BYTES] = [0; DESCRIPTOR_BYTES];
 
 /// Corresponding features of two photographs.

@@ -2,7 +2,7 @@
 //!
 //! Features ([`Features`]) are found in each photograph, matched between pairs ([`PairMatches`]), verified by two-view geometry,
 //! and mapped incrementally with bundle adjustment. Geometry is `f64`; every sum and every random choice has a fixed order, so
-//! that neither the number of threads nor the order of the files changes a byte of the result.
+//! neither the number of threads nor the order of the files changes a byte of the result.
 #![forbid(unsafe_code)]
 
 pub mod adjust;

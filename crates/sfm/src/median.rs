@@ -1,4 +1,4 @@
-/// The median, of an even number the upper of the two in the middle; `None` of nothing.
+/// The median, for an even count the upper of the two middle values; `None` for no values.
 pub(crate) fn median(mut values: Vec<f64>) -> Option<f64> {
     let middle = values.len() / 2;
     (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)

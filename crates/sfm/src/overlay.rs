@@ -1,46 +1,48 @@
-//! What lies over all pictures at the same place, opaque or not: writing, logos, watermarks. Its edges are the same wherever the camera is, those of the scene
-//! are not: the median of the gradients shows it alone (Dekel et al., *On the Effectiveness of Visible Watermarks*, 2017).
+//! Detection of what is laid over all photographs at the same position, opaque or not: text, logos, watermarks. Its edges are the same
+//! wherever the camera is, those of the scene are not, so the median of the gradients shows only the overlay (Dekel et al., *On the
+//! Effectiveness of Visible Watermarks*, 2017).
 
 use crate::median;
 use rayon::prelude::*;
 
-/// Pictures from which on it can be told, and those that are examined, at most, evenly chosen.
+/// Minimum number of photographs for a detection, and maximum number that are examined, evenly selected.
 const FEWEST: usize = 8;
 const EXAMINED: usize = 48;
 
-/// An edge of what lies over the pictures.
+/// Thresholds for an edge of an overlay.
 #[derive(Clone, Copy)]
 struct Edge {
-    /// Least slope, of 255 a pixel.
+    /// Minimum slope, levels of 255 per pixel.
     slope: f64,
-    /// Part of the pictures that have this edge, at least half as steep.
+    /// Minimum fraction of the photographs that have this edge at least half as steep.
     agree: f64,
 }
 
-/// Half-transparent white writing across a bright wall has slopes of 8 to 50.
+/// Semi-transparent white text across a bright wall has slopes of 8 to 50.
 const EDGE: Edge = Edge { slope: 6.0, agree: 0.8 };
-/// An edge that is hardly one of the scene, and the part of the pixels that have one where something lies over them: 0.2 to 1.3 % with a watermark, a date or a logo, 0.65 %
-/// in a drone's film with two; none in 16 captures without, but for three whose camera hardly moves: 0.01 % (fern), 0.02 and 0.06 %.
+/// An edge that is hardly one of the scene, and the minimum fraction of pixels with such an edge for an overlay: 0.2 to 1.3 % with a
+/// watermark, a date or a logo, 0.65 % in a drone's film with two; none in 16 captures without an overlay, except for three whose camera
+/// hardly moves: 0.01 % (fern), 0.02 and 0.06 %.
 const SURE: Edge = Edge {
     slope: 10.0,
     agree: 0.9,
 };
 const ENOUGH: f64 = 0.001;
-/// Edge pixels of a square of 5 by 5 around one, at least, itself included: single ones are chance.
+/// Minimum number of edge pixels in the square of 5 x 5 around an edge pixel, itself included: single ones are coincidence.
 const TOGETHER: usize = 5;
-/// What is this near an edge, px, belongs to it: strokes are as thin.
+/// Pixels up to this distance from an edge belong to the overlay, px: strokes are as thin.
 const STROKE: usize = 3;
 
-/// Pictures of one camera over which something may lie.
+/// Photographs from one camera that may have an overlay.
 pub struct Overlay<'a> {
     width: usize,
     height: usize,
-    /// Some of them, `[H, W, 3]`; none where there are few.
+    /// Some of the photographs, `[H, W, 3]`; empty if there are too few.
     pictures: Vec<&'a [u8]>,
 }
 
 impl<'a> Overlay<'a> {
-    /// Of `pictures`, `[H, W, 3]`.
+    /// An overlay detector for `pictures`, `[H, W, 3]`.
     pub fn of(width: usize, height: usize, pictures: &[&'a Vec<u8>]) -> Self {
         let some = pictures.iter().step_by(pictures.len().div_ceil(EXAMINED).max(1));
         let some = some.filter(|_| pictures.len() >= FEWEST);
@@ -51,13 +53,13 @@ impl<'a> Overlay<'a> {
         }
     }
 
-    /// Whether something does, beyond doubt.
+    /// Whether there is an overlay beyond doubt.
     pub fn is_sure(&self) -> bool {
         let edges = self.edges(SURE).into_iter().filter(|edge| *edge).count();
         edges as f64 >= ENOUGH * (self.width * self.height) as f64
     }
 
-    /// The pixels over which something lies in all pictures.
+    /// `[H, W]` whether each pixel is covered by the overlay.
     pub fn pixels(&self) -> Vec<bool> {
         let (width, height) = (self.width, self.height);
         let edges = self.edges(EDGE);
@@ -75,7 +77,7 @@ impl<'a> Overlay<'a> {
         lies
     }
 
-    /// The pixels with such an edge.
+    /// `[H, W]` whether each pixel has such an edge.
     fn edges(&self, edge: Edge) -> Vec<bool> {
         let is_edge = |at: usize| {
             let (x, y) = (at % self.width, at / self.width);
@@ -85,7 +87,7 @@ impl<'a> Overlay<'a> {
         (0..self.width * self.height).into_par_iter().map(is_edge).collect()
     }
 
-    /// Whether there is such an edge at pixel `at`.
+    /// Whether there is such an edge in `channel` at pixel `at`.
     fn has_edge(&self, at: usize, channel: usize, edge: Edge) -> bool {
         let slope = |picture: &[u8]| {
             let value = |at: usize| f64::from(picture[3 * at + channel]);
@@ -110,7 +112,7 @@ mod tests {
     const WIDTH: usize = 80;
     const HEIGHT: usize = 60;
 
-    /// Pictures of a texture that moves by 7 px each, with white that lets 60 % of it through where `lies` says.
+    /// Photographs of a texture that moves by 7 px each, covered by white that lets 60 % of it through where `lies` is true.
     fn pictures(lies: impl Fn(usize, usize) -> bool) -> Vec<Vec<u8>> {
         let picture = |i: usize| {
             let pixel = |at: usize| {

@@ -1,55 +1,59 @@
-//! What stands still in the pictures of a camera while the rest moves: the background of a turntable, parts of what carries the camera, writing.
+//! Segmentation of what stands still in the photographs of a camera while the rest moves: the background of a turntable, parts of what
+//! carries the camera, text.
 //!
-//! Background subtraction, as for a camera at rest (Stauffer and Grimson, "Adaptive background mixture models", 1999, with the strongest mode alone), in patches and
-//! relative to their texture, so that plain surfaces that move are not taken for others that do not: a patch without texture takes the side of what surrounds it.
+//! Background subtraction, as for a camera at rest (Stauffer and Grimson, "Adaptive background mixture models", 1999, with the strongest
+//! mode only), in patches and relative to their texture, so that plain surfaces that move are not mistaken for others that do not: a
+//! patch without texture gets the label of its surroundings.
 
 use crate::median;
 use rayon::prelude::*;
 
-/// Pictures at most of which the colours behind are found.
+/// Maximum number of photographs from which the background's colours are estimated.
 const SAMPLES: usize = 32;
-/// Largest difference of a channel between pictures that show the same at a pixel, of 255: noise, and a little of other light.
+/// Maximum difference of a channel between photographs that show the same at a pixel, of 255: noise, and slightly different light.
 const SAME: u8 = 15;
-/// Least fraction of the pictures that show the colour behind.
+/// Minimum fraction of the photographs that show the background's colour.
 const SUPPORT: f32 = 0.25;
-/// Pixels on each side of a patch's centre.
+/// Number of pixels on each side of a patch's centre.
 const REACH: usize = 2;
-/// Standard deviation of a channel from which on a patch has texture, and difference from which on it certainly differs, of 255.
+/// Minimum standard deviation of a channel for a patch to have texture, and minimum difference for it to certainly differ, of 255.
 const TEXTURE: f32 = 5.0;
 const DIFFERS: f32 = 7.5;
-/// Variance of the difference by that of the patch, up to which it stands still, and from which on it moves.
+/// Variance of the difference relative to that of the patch, up to which the patch stands still, and above which it moves.
 const STILL: f32 = 0.15;
 const MOVES: f32 = 0.5;
-/// Largest difference of a channel's mean, of 255, of what stands still in other light.
+/// Maximum difference of a channel's mean, of 255, for what stands still in other light.
 const SHADE: f32 = 20.0;
-/// Difference of a patch without texture by that of half of the patches that stand still, up to which it is noise, also between pictures, the support it needs, and the part of the pixels around
-/// such a region that must stand still, so that it does: a wall between twigs, but not a white floor on which all moves.
+/// A patch without texture is quiet if its difference, also between photographs, is up to this many times the median difference of
+/// patches that stand still, which makes it noise, and if it has this support. A region of such patches stands still if more than this
+/// fraction of the pixels around it do: a wall between twigs, but not a white floor on which everything moves.
 const QUIET: f64 = 3.0;
 const QUIET_SUPPORT: f32 = 0.6;
 const BESIDE: f64 = 0.1;
-/// Fraction of the pixels up to which a region is noise.
+/// A region of less than this fraction of the pixels is noise.
 const SPECK: f64 = 0.0008;
 
-/// What a patch does.
+/// The state of a patch.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Label {
     Still,
     Moving,
-    /// Without texture, and what differs is noise.
+    /// Without texture, and its difference is noise.
     Quiet,
+    /// Undecided.
     Open,
 }
 
-/// What is the same in most pictures of a camera.
+/// What is the same in most photographs from a camera.
 pub struct StillScene {
     width: usize,
     /// `[3][H, W]`
     color: [Vec<f32>; 3],
     /// `[H, W]` the variance around each pixel.
     texture: Vec<f32>,
-    /// `[H, W]` the fraction of the pictures that show it.
+    /// `[H, W]` the fraction of the photographs that show this colour.
     support: Vec<f32>,
-    /// `[H, W]` whether enough show it, and differ by no more than noise.
+    /// `[H, W]` whether enough photographs show this colour and differ only by noise.
     constant: Vec<bool>,
 }
 
@@ -57,7 +61,7 @@ impl StillScene {
     /// What most of `pictures`, `[H, W, 3]`, show.
     ///
     /// # Panics
-    /// When there is no picture, or one has not `width * height` pixels.
+    /// When there is no picture, or one does not have `width * height` pixels.
     pub fn of(width: usize, height: usize, pictures: &[impl AsRef<[u8]>]) -> Self {
         let samples = samples(width, height, pictures);
         let at = |pixel: usize| {
@@ -81,7 +85,7 @@ impl StillScene {
         }
     }
 
-    /// Where `picture`, `[H, W, 3]`, shows this scene.
+    /// The parts of `picture`, `[H, W, 3]`, that show this scene.
     ///
     /// # Panics
     /// When the picture has another size.
@@ -96,7 +100,7 @@ impl StillScene {
         }
     }
 
-    /// What each patch of a picture does if this scene is `light` times as bright there.
+    /// `[H, W]` the label of each patch of a photograph in which this scene is `light` times as bright.
     fn labels_in(&self, light: [f32; 3], color: &[Vec<f32>; 3], texture: &[f32]) -> Vec<Label> {
         let difference = [0, 1, 2].map(|c| -> Vec<f32> {
             let both = color[c].iter().zip(&self.color[c]);
@@ -132,7 +136,7 @@ impl StillScene {
         labels
     }
 
-    /// How much brighter than here each channel of a picture is where it shows this scene.
+    /// Brightness of each channel of a photograph relative to this scene, where the photograph shows it.
     fn light(&self, color: &[Vec<f32>; 3], labels: &[Label]) -> [f32; 3] {
         let sum = |values: &[f32]| -> f32 {
             let of = values.iter().zip(labels).filter(|v| *v.1 == Label::Still);
@@ -149,7 +153,7 @@ impl StillScene {
     }
 }
 
-/// Where a picture shows a [`StillScene`].
+/// The parts of a photograph that show a [`StillScene`].
 pub struct Shown {
     width: usize,
     /// `[H, W]`
@@ -157,18 +161,18 @@ pub struct Shown {
 }
 
 impl Shown {
-    /// The fraction of the pixels whose texture is that of the scene.
+    /// The fraction of the pixels that stand still with the texture of the scene.
     pub fn share(&self) -> f64 {
         let still = self.labels.iter().filter(|label| **label == Label::Still).count();
         still as f64 / self.labels.len() as f64
     }
 
-    /// `[H, W]` where it is.
+    /// `[H, W]` whether each pixel shows the scene.
     pub fn mask(mut self) -> Vec<bool> {
         let (width, labels) = (self.width, &mut self.labels);
         let least = (SPECK * labels.len() as f64) as usize;
         join(width, labels, BESIDE, |label, _| label == Label::Quiet);
-        // What is left of them has nothing beside it that tells.
+        // The remaining quiet regions have no labelled pixels around them.
         (labels.iter_mut().filter(|label| **label == Label::Quiet)).for_each(|label| *label = Label::Open);
         join(width, labels, 0.5, |label, _| label == Label::Open);
         smooth(width, labels);
@@ -177,17 +181,17 @@ impl Shown {
     }
 }
 
-/// The colour that most pictures have at a pixel.
+/// The most frequent colour at a pixel.
 struct Mode {
     color: [f32; 3],
-    /// The fraction of the pictures that have it; 0 of fewer than three.
+    /// The fraction of the photographs that have it; 0 for fewer than three photographs.
     support: f32,
-    /// Among those, summed over the channels.
+    /// Variance among those, summed over the channels.
     variance: f32,
 }
 
 impl Mode {
-    /// The first of several.
+    /// The mode of `colors`, the first of several equal ones.
     fn of(colors: &[[u8; 3]]) -> Self {
         let same = |a: &[u8; 3], b: &[u8; 3]| a.iter().zip(b).all(|(a, b)| a.abs_diff(*b) <= SAME);
         let count = |a: &[u8; 3]| colors.iter().filter(|b| same(a, b)).count();
@@ -208,10 +212,10 @@ impl Mode {
     }
 }
 
-/// Some of `pictures`, `[H, W, 3]`, evenly over all of them: enough to tell what is behind.
+/// Some of `pictures`, `[H, W, 3]`, evenly selected: enough to determine the background.
 ///
 /// # Panics
-/// When there is no picture, or one has not `width * height` pixels.
+/// When there is no picture, or one does not have `width * height` pixels.
 pub(crate) fn samples(width: usize, height: usize, pictures: &[impl AsRef<[u8]>]) -> Vec<&[u8]> {
     assert!(!pictures.is_empty() && pictures.iter().all(|p| p.as_ref().len() == 3 * width * height));
     let count = pictures.len().min(SAMPLES);
@@ -257,8 +261,8 @@ pub(crate) fn variance(width: usize, color: &[Vec<f32>; 3]) -> Vec<f32> {
     variance
 }
 
-/// Lets connected pixels of one label that are `weak`, by the label and their number, stand still if more than the part `least` of what is around them does, and
-/// else move.
+/// Relabels each connected region of one label for which `weak(label, pixels)` is true: it stands still if more than the fraction `least`
+/// of the labelled pixels around it do, otherwise it moves.
 fn join(width: usize, labels: &mut [Label], least: f64, weak: impl Fn(Label, usize) -> bool) {
     let mut seen = vec![false; labels.len()];
     for start in 0..labels.len() {
@@ -292,7 +296,7 @@ fn join(width: usize, labels: &mut [Label], least: f64, weak: impl Fn(Label, usi
     }
 }
 
-/// The pixels beside, above and below another of `pixels`.
+/// The up to four neighbours of the pixel `at`, out of `pixels`.
 pub(crate) fn adjacent(width: usize, pixels: usize, at: usize) -> impl Iterator<Item = usize> {
     let x = at % width;
     let to = [
@@ -304,7 +308,7 @@ pub(crate) fn adjacent(width: usize, pixels: usize, at: usize) -> impl Iterator<
     to.into_iter().flatten()
 }
 
-/// Gives each pixel the label that most of it and the four around it have.
+/// Gives each pixel the label of the majority of itself and its four neighbours.
 fn smooth(width: usize, labels: &mut [Label]) {
     let before = labels.to_vec();
     for (at, label) in labels.iter_mut().enumerate() {
@@ -324,7 +328,7 @@ fn smooth(width: usize, labels: &mut [Label]) {
     }
 }
 
-/// What stands still and the pixels around it, which show a little of it.
+/// `[H, W]` the pixels that stand still and their neighbours, which show a little of the still scene.
 fn grown(width: usize, labels: &[Label]) -> Vec<bool> {
     let is_still = |at: usize| labels[at] == Label::Still;
     let all = 0..labels.len();
@@ -348,7 +352,7 @@ mod tests {
         40.0 + 2.0 * picture as f32
     }
 
-    /// A disc of 60 pixels that wanders over `behind` and has one colour at its centre, in `light`.
+    /// A disc 60 pixels wide that moves across the background `behind` and has a single colour at its centre, in `light`.
     fn turntable(
         pictures: usize,
         behind: impl Fn(usize, usize, usize) -> u8,
@@ -375,7 +379,7 @@ mod tests {
         pictures.iter().map(|picture| still.shown(picture).mask()).collect()
     }
 
-    /// The fractions of what is behind and of the disc that are masked.
+    /// The fractions of the background and of the disc that are masked.
     fn masked(pictures: &[Vec<u8>]) -> [f64; 2] {
         let masks = masks(pictures);
         let (mut still, mut of) = ([0usize; 2], [0usize; 2]);
@@ -404,7 +408,7 @@ mod tests {
         let other = turntable(1, |x, y, _| noise(3, x / 4, y / 4).min(250), |_| 1.0).remove(0);
         let shares = [&pictures[7], &other].map(|picture| still.shown(picture).share());
         assert!(shares[0] > 0.5 && shares[1] < 0.05, "{shares:?}");
-        // In light that changes from picture to picture, and with a plain part that writing surrounds.
+        // In light that changes from photograph to photograph, and with a plain part surrounded by texture.
         let plain = |x: usize, y: usize, _: usize| {
             if (40..110).contains(&x) && y < 25 {
                 120
@@ -418,7 +422,8 @@ mod tests {
 
     #[test]
     fn a_plain_floor_that_moves_is_not_masked() {
-        // All that stands still is a label in the corner; the floor, 14,000 pixels, is plain but for its shade, and what moves on it has texture.
+        // Only a label in the corner stands still; the floor, 14,000 pixels, is plain except for its shading, and what moves on it has
+        // texture.
         let shaded = |x: usize, i: usize| (120 + (x + 2 * i) / 8) as u8;
         let corner = |x: usize, y: usize, i: usize| {
             if x < 20 && y < 20 {

@@ -1,21 +1,22 @@
-//! Which way is up in a scene, from how its photographs were held.
+//! The up direction of a scene, from the orientation of its photographs.
 
 use crate::geometry::linear::{scatter, symmetric_eigen};
 use crate::geometry::pose::DPose;
 use crate::median;
 use glam::{DQuat, DVec3};
 
-/// Standard deviation of the viewing directions of a survey about their mean at most, degrees.
+/// Maximum standard deviation of the viewing directions of a survey about their mean, degrees.
 const PARALLEL: f64 = 15.0;
-/// Standard deviation of the positions of its cameras across their views at least, in the direction in which it is less, by the distance of the points.
-/// Of 50 captures those by kite and by drone have 0.27 and 0.47 (12 and 3 degrees); those that look ahead so nearly in parallel up to 0.21.
+/// Minimum standard deviation of the positions of its cameras perpendicular to their views, in the direction in which it is smallest,
+/// relative to the distance of the points. Of 50 captures, those by kite and by drone have 0.27 and 0.47 (12 and 3 degrees); those that
+/// look ahead almost as much in parallel have up to 0.21.
 const SPREAD: f64 = 0.25;
 
-/// The direction up, from the rotation of each camera to the world and the direction up in its own axes, if known: photographs are
-/// held level more often than not, so that all their x axes lie in one horizontal plane.
+/// The up direction, from the rotation of each camera to the world and the up direction in its own axes, if known: most photographs are
+/// level, so all their x axes are in one horizontal plane.
 ///
-/// Its normal is the answer if the x axes leave no doubt about it and it agrees with the mean of the photographs' own up
-/// directions; otherwise that mean.
+/// The result is the normal of this plane if the x axes determine it clearly and it agrees with the mean of the photographs' own up
+/// directions; otherwise it is that mean.
 pub fn up(cameras: impl Iterator<Item = (DQuat, Option<DVec3>)>) -> DVec3 {
     let mut mean = DVec3::ZERO;
     let rights = cameras.map(|(rotation, own)| {
@@ -27,7 +28,7 @@ pub fn up(cameras: impl Iterator<Item = (DQuat, Option<DVec3>)>) -> DVec3 {
     let mean = mean.normalize_or(DVec3::NEG_Y);
     let normal = DVec3::from_array(vectors[0]);
     let normal = normal * normal.dot(mean).signum();
-    // Within 30 degrees, and the second axis at least five times as wide as what is left over.
+    // The normal is within 30 degrees of the mean, and the second axis spreads at least five times as much as the normal.
     if values[1] > 5.0 * values[0] && values[1] > 0.02 * values[2] && normal.dot(mean) > 0.866 {
         normal
     } else {
@@ -35,17 +36,17 @@ pub fn up(cameras: impl Iterator<Item = (DQuat, Option<DVec3>)>) -> DVec3 {
     }
 }
 
-/// A scene that is photographed straight from above.
+/// A scene that was photographed from straight above.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Survey {
-    /// Against the cameras' common direction, a unit vector.
+    /// Unit vector opposite to the cameras' common direction.
     pub up: DVec3,
-    /// Of the ground, below the mean of the cameras.
+    /// Centre of the ground, below the mean of the cameras.
     pub center: DVec3,
 }
 
-/// The survey that `cameras` made of `points`, if they look straight down as those of one do: in one direction, from all over a plane across it,
-/// farther apart than handheld photographs of a wall are. None of its photographs has an up of its own.
+/// The survey of `points` by `cameras`, if these look straight down as in a survey: in one direction, from positions all over a plane
+/// perpendicular to it, farther apart than handheld photographs of a wall. No photograph of a survey determines up on its own.
 pub fn survey(cameras: &[DPose], points: impl Iterator<Item = DVec3>) -> Option<Survey> {
     let n = cameras.len() as f64;
     let forward = (cameras.iter().map(|pose| pose.rotation * DVec3::Z).sum::<DVec3>()).try_normalize()?;
@@ -57,7 +58,7 @@ pub fn survey(cameras: &[DPose], points: impl Iterator<Item = DVec3>) -> Option<
     let mean = cameras.iter().map(|pose| pose.position).sum::<DVec3>() / n;
     let depth = median(points.map(|point| (point - mean).dot(forward)).collect())?;
     let across = (cameras.iter()).map(|pose| (pose.position - mean).reject_from_normalized(forward));
-    // The first eigenvalue is that along the views.
+    // The first eigenvalue is the one along the views.
     let ([_, narrow, _], _) = symmetric_eigen(scatter(across));
     (depth > 0.0 && (narrow / n).sqrt() > SPREAD * depth).then_some(Survey {
         up: -forward,
@@ -86,7 +87,7 @@ mod tests {
         assert!(found.up.angle_between(DVec3::NEG_Z) < 0.06, "{found:?}");
         assert!((found.center - DVec3::new(2.0, 1.5, 4.0)).length() < 0.3, "{found:?}");
         assert_eq!(survey(&grid(0.5), points()), None);
-        // Around something.
+        // Cameras that look around.
         let mut around = grid(1.0);
         for (i, pose) in around.iter_mut().enumerate() {
             pose.rotation = DQuat::from_rotation_y(0.1 * i as f64 - 1.0);

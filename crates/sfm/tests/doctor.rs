@@ -1,4 +1,4 @@
-//! The doctor on synthetic worlds: each fault is found where it is, and not elsewhere.
+//! The doctor on synthetic worlds: each fault is found where it is and nowhere else.
 
 mod world;
 
@@ -11,7 +11,7 @@ use irradia_sfm::geometry::pose::DPose;
 use irradia_sfm::map::{MapOptions, Model, verify};
 use world::{CAMERA, World, around, look};
 
-/// All diagnoses of a world: with the model, and from its pairs alone.
+/// All diagnoses of a world: with the model, and from its pairs only.
 fn examine(world: &World, appearances: &[Appearance], colors: &[Vec<[u8; 3]>]) -> [Vec<Diagnosis>; 2] {
     let found = world.map();
     let (cameras, pairs) = verify(
@@ -171,7 +171,7 @@ fn turning_on_the_spot_is_named_and_is_the_one_reason() {
 
 #[test]
 fn a_turn_on_the_spot_between_two_walks_is_why_there_are_two_models() {
-    // Sideways past what is ahead, a turn to the right, sideways again.
+    // The camera moves sideways past the scene ahead, turns to the right, and moves sideways again.
     let (walk, turn) = (12, 12);
     let toward = |degrees: f64| DVec3::new(degrees.to_radians().sin(), degrees.to_radians().cos(), 0.0);
     let pose = |degrees: f64, aside: f64| {
@@ -201,7 +201,7 @@ fn a_turn_on_the_spot_between_two_walks_is_why_there_are_two_models() {
     };
     let in_turn = walk as usize..=(walk + turn) as usize;
     assert!(ends.iter().all(|end| in_turn.contains(end)), "{ends:?}");
-    // A photograph in the middle of the turn may be in neither.
+    // A photograph in the middle of the turn may be in neither model.
     assert!(sides.iter().all(|side| (17..20).contains(side)), "{sides:?}");
 }
 
@@ -361,7 +361,7 @@ fn a_zoom_so_far_that_nothing_matches_is_named_from_both_models() {
 
 #[test]
 fn a_background_with_most_of_the_features_stands_still() {
-    // Of the object nothing matches: the background of each photograph is in the same place as in the one before.
+    // Nothing on the object matches: the background of each photograph is in the same position as in the one before.
     let mut world = ring(24, 2500, 0..0);
     let background = world.features[0].clone();
     world
@@ -378,7 +378,7 @@ fn a_background_with_most_of_the_features_stands_still() {
     let still = alone
         .iter()
         .find(|diagnosis| matches!(diagnosis, Diagnosis::StandsStill { .. }));
-    // Those at both ends of the chain have one partner.
+    // The photographs at both ends of the chain have one partner.
     let named = (1..12).chain([0, 12]).collect();
     assert_eq!(still.map(Diagnosis::photos), Some(named), "{alone:?}");
     assert!(
@@ -402,9 +402,9 @@ fn a_mask_that_hides_all_is_named_in_place_of_darkness_and_texture() {
     world.features[7] = Features::default();
     world.pairs.retain(|pair| !pair.photos.contains(&7));
     let mut appearances = sharp(&world);
-    // As of a picture of which nothing is left.
+    // As for a photograph that is hidden entirely.
     appearances[7] = Appearance::from_array([0.0, 0.0, 0.0, 0.0, 1.0]);
-    // What is hidden of one with features is no fault.
+    // Hidden parts of a photograph with features are not a fault.
     appearances[11].hidden = 0.95;
     for found in examine(&world, &appearances, &grey(&world)) {
         let looks = [Kind::Hidden, Kind::FewFeatures, Kind::Exposure, Kind::Blurred];
@@ -434,7 +434,7 @@ fn nothing_and_one_photograph_have_nothing_wrong() {
 #[test]
 fn something_that_moves_is_named_and_nothing_else() {
     let mut world = ring(24, 1500, 0..0);
-    // A flat thing of 40 features, each time elsewhere in the picture.
+    // A flat object with 40 features, at another position in each photograph.
     let mut rng = irradia_scene::Rng::new(8, 8);
     let thing: Vec<[f32; 2]> = (0..40).map(|_| [0; 2].map(|_| rng.range(0.0, 180.0))).collect();
     let mut first = Vec::new();
@@ -467,7 +467,7 @@ fn what_stands_on_a_flat_ground_does_not_move() {
     let ground: Vec<(DVec3, DVec3)> = (0..1500)
         .map(|_| (DVec3::new(uniform(-2.5, 2.5), uniform(-2.5, 2.5), 0.0), DVec3::Z))
         .collect();
-    // The one side of a thing that the cameras see.
+    // The only side of an object that the cameras see.
     let side: Vec<(DVec3, DVec3)> = (0..100)
         .map(|_| (DVec3::new(0.0, uniform(-0.6, 0.6), uniform(0.1, 0.8)), DVec3::X))
         .collect();
@@ -496,7 +496,7 @@ fn places_that_are_one_by_a_part_alone_are_mapped_apart() {
     let mut direction = move || DVec3::new(uniform(), uniform(), uniform());
     let mut some =
         |n: usize| -> Vec<(DVec3, DVec3)> { (0..n).map(|_| (2.5 * direction(), direction().normalize())).collect() };
-    // Below the pictures of the first place.
+    // Far below everything that the photographs of the first place show.
     let below = DVec3::new(0.0, 0.0, -1000.0);
     let moved = |points: &[(DVec3, DVec3)]| points.iter().map(|p| (p.0 + below, p.1)).collect::<Vec<_>>();
     let (alike, own, others) = (some(160), some(2600), some(2600));

@@ -1,4 +1,4 @@
-//! SIFT on pictures whose features are known: blobs, and the same texture seen from elsewhere.
+//! SIFT on photographs with known features: blobs, and the same texture seen from another viewpoint.
 
 use irradia_compute::Level;
 use irradia_scene::Rng;
@@ -14,7 +14,7 @@ struct Picture {
 }
 
 impl Picture {
-    /// Samples `shade`, in \[0, 1\], at the centres of the pixels.
+    /// Samples `shade`, with values in \[0, 1\], at the centres of the pixels.
     fn new(width: u32, height: u32, shade: impl Fn(f64, f64) -> f64) -> Self {
         let pixel = |i: u32| shade(f64::from(i % width) + 0.5, f64::from(i / width) + 0.5);
         Self {
@@ -38,7 +38,7 @@ impl Picture {
     }
 }
 
-/// Blobs of random places, sizes, shapes and shades, as a function of the place.
+/// Blobs with random positions, sizes, shapes and shades, as a function of position.
 fn texture(size: f64) -> impl Fn(f64, f64) -> f64 {
     let mut rng = Rng::new(7, 0);
     let mut uniform = move |from: f64, to: f64| from + (to - from) * f64::from(rng.uniform());
@@ -67,14 +67,14 @@ fn a_blob_is_found_at_its_place_and_scale() {
         let blob =
             |px: f64, py: f64| 0.2 + 0.6 * (-((px - x).powi(2) + (py - y).powi(2)) / (2.0 * sigma * sigma)).exp();
         let features = Picture::new(130, 120, blob).features();
-        // No direction dominates, so there may be several features, at one place; and some on the dark ring around it.
+        // No direction dominates, so there may be several features at the same position, and some on the dark ring around it.
         let distance = |k: &Keypoint| (f64::from(k.x) - x).hypot(f64::from(k.y) - y);
         let at_centre: Vec<&Keypoint> = features.keypoints.iter().filter(|k| distance(k) < sigma).collect();
         assert!(!at_centre.is_empty(), "sigma {sigma}");
         for keypoint in at_centre {
             assert!(distance(keypoint) < 0.03 * sigma, "sigma {sigma}: {keypoint:?}");
             // The difference of Gaussians of sigma and k sigma at a blob's centre is largest where k sigma^2 is the blob's variance;
-            // half a pixel of blur is assumed to be the camera's. The quadratic in scale costs a few per cent.
+            // half a pixel of blur is attributed to the camera. The quadratic fit in scale is off by a few per cent.
             let expected = ((sigma * sigma - 0.25) / 2f64.powf(1.0 / 3.0)).sqrt();
             let ratio = f64::from(keypoint.scale) / expected;
             assert!(
@@ -123,7 +123,7 @@ fn a_tilted_view_matches_as_it_looks_from_the_front() {
     };
     let [upright, tilted] = [
         Picture::new(300, 300, &shade),
-        // Seen at 70 degrees from the front: a third of the width remains.
+        // Tilted by 70 degrees from the frontal view: a third of the width remains.
         Picture::new(100, 300, |x, y| shade(3.0 * x, y)),
     ]
     .map(|picture| frontal.extract(&picture.photo()));
@@ -143,7 +143,7 @@ fn a_tilted_view_matches_as_it_looks_from_the_front() {
     let (with, all) = right(match_features(&upright, &tilted, &options));
     assert!(with >= 20 + 3 * without, "{with} right matches, without {without}");
     assert!(10 * with >= 9 * all, "{with} of {all} are right");
-    // What has no second view keeps its matches.
+    // If one of the photographs has no frontal descriptors, the usual matches stay.
     assert!(
         !usual(&upright).keypoints.is_empty()
             && right(match_features(&upright, &usual(&tilted), &options)).0 == without
@@ -156,7 +156,7 @@ fn a_turned_and_enlarged_photograph_has_its_features_at_the_mapped_places() {
     let upright = Picture::new(300, 300, &shade).features();
     let (sin, cos) = 0.55f64.sin_cos();
     let enlarged = 1.4;
-    // About the centres of both pictures.
+    // Rotated about the centres of both photographs.
     let picture = Picture::new(420, 420, |x, y| {
         let (dx, dy) = ((x - 210.0) / enlarged, (y - 210.0) / enlarged);
         shade(150.0 + cos * dx + sin * dy, 150.0 - sin * dx + cos * dy)
@@ -246,7 +246,7 @@ fn masks_limits_and_reduced_sizes_are_respected() {
     assert_eq!(few.keypoints.len(), 50);
     assert!(few.keypoints.iter().all(|k| all.keypoints.contains(k)));
     assert!(few.keypoints.is_sorted_by(|a, b| a.scale >= b.scale));
-    // A picture whose pixels are repeated in 2 x 2, reduced again, is the picture; places are those in the large one.
+    // A photograph whose pixels are repeated 2 x 2 is the same when reduced again; positions are those in the large one.
     let large = Picture::new(480, 400, |x, y| {
         f64::from(picture.data[(y / 2.0) as usize * 240 + (x / 2.0) as usize]) / 255.0
     });

@@ -1,4 +1,4 @@
-//! What the mapper finds of lenses on synthetic worlds: focal lengths, principal points, fisheyes.
+//! The lenses that the mapper finds on synthetic worlds: focal lengths, principal points, fisheyes.
 
 mod world;
 
@@ -24,7 +24,7 @@ fn principal_points_of_photographs_cut_beside_their_middles_are_found() {
     let same = |_| [0.1, 0.8];
     let own = |photo: usize| corners[photo % 5];
     let shared = alike(all.clone().cut_beside(|_| 0.8, same));
-    // With one photograph a camera, the lens' distortion stays unknown.
+    // With one photograph per camera, the lens's distortion stays unknown.
     let each = all.cut_beside(|_| 0.8, own);
     for (world, before, least, off) in [
         (shared, &same as &dyn Fn(usize) -> [f64; 2], [95.0, 99.0], 3.0),
@@ -46,7 +46,7 @@ fn principal_points_of_photographs_cut_beside_their_middles_are_found() {
     }
 }
 
-/// Photographs of a room all around by a lens of short focal length, 300 px at 1000.
+/// Photographs of a room, taken all around with a lens of short focal length, 300 px for a width of 1000 px.
 fn wide(fisheye: bool) -> World {
     let mut rng = Rng::new(7, 1);
     let mut uniform = move || f64::from(rng.range(-1.0, 1.0));
@@ -104,7 +104,7 @@ fn the_pairs_tell_the_focal_length_of_narrow_and_of_very_wide_views() {
         let camera = DCamera::centered(CAMERA.width, CAMERA.height, focal);
         let mut rng = Rng::new(4, 1);
         let mut uniform = || f64::from(rng.range(-1.0, 1.0));
-        // What is in sight at a distance of 5 and in front of the cameras.
+        // The points are in sight at a distance of 5, in front of the cameras.
         let reach = (2.5 / by_side).min(4.0);
         let points: Vec<(DVec3, DVec3)> = (0..1500)
             .map(|_| {
@@ -144,12 +144,12 @@ fn photographs_of_as_many_cameras_get_their_own_focal_lengths() {
         for camera in model.cameras.iter().flatten() {
             assert!((camera.focal() / 870.0 - 1.0).abs() < 0.03, "{camera:?}");
         }
-        // The lens of a single photograph is not adjusted: the worlds' distort by up to 1 %.
+        // The lens of a single photograph is not adjusted: those of the worlds distort by up to 1 %.
         assert!(world.auc(model, 5.0) > 97.0, "{seed}: {}", world.auc(model, 5.0));
     }
 }
 
-/// A ring of narrow views: pairs fit nearly every focal length, and a model from a short one is flat.
+/// A ring of narrow views: nearly every focal length fits the pairs, and a model that starts with a short one is flat.
 #[test]
 fn narrow_views_all_around_are_one_model() {
     let camera = DCamera::centered(CAMERA.width, CAMERA.height, 6.0 * f64::from(CAMERA.width));
@@ -161,7 +161,7 @@ fn narrow_views_all_around_are_one_model() {
         .collect();
     let mut rng = Rng::new(3, 0);
     let mut uniform = |range: f32| f64::from(rng.range(-range, range));
-    // On a cylinder.
+    // Points on a cylinder.
     let points: Vec<(DVec3, DVec3)> = (0..1000)
         .map(|_| {
             let angle = uniform(std::f32::consts::PI);

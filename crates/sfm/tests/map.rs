@@ -39,7 +39,7 @@ fn cameras_return_from_noise_wrong_matches_and_an_unknown_lens() {
     assert!((0.5..0.7).contains(&model.mean_error()), "{}", model.mean_error());
     // Wrong matches that happen to agree with the geometry are few.
     assert!(model.points.len() < 3300, "{}", model.points.len());
-    // Upright and centred: cameras above the points on average, the middle of the sphere near the origin.
+    // The model is upright and centred: cameras are above the points on average, and the centre of their ring is near the origin.
     let mean = model.poses.iter().flatten().map(|p| p.position).sum::<DVec3>() / 24.0;
     assert!(mean.z > 0.2 && mean.truncate().length() < 0.1, "{mean}");
     let up = model
@@ -57,7 +57,7 @@ fn cameras_return_from_noise_wrong_matches_and_an_unknown_lens() {
 #[test]
 fn photographs_are_registered_into_a_known_model_that_stays_as_it_is() {
     let mut world = World::new(around(24, 1.0), 2000, 0.5, 0.3, 4);
-    // The last photographs are by a camera of their own.
+    // The last photographs are from another camera.
     for photo in &mut world.photos[20..] {
         photo.group = 1;
     }
@@ -77,7 +77,7 @@ fn photographs_are_registered_into_a_known_model_that_stays_as_it_is() {
     let model = &result.models[0];
     assert_eq!(model.registered(), 24);
     assert!(model.poses[..16] == known.poses[..16] && model.cameras[0] == known.cameras[0]);
-    // In the world of what is known: places, not only relative poses.
+    // The model is in the world of the known poses: positions agree, not only relative poses.
     for (found, truth) in model.poses.iter().flatten().zip(&world.poses) {
         assert!((found.position - truth.position).length() < 0.03, "{found:?} {truth:?}");
     }
@@ -88,7 +88,7 @@ fn photographs_are_registered_into_a_known_model_that_stays_as_it_is() {
 #[test]
 fn a_model_is_completed_and_another_beside_it_stays() {
     let world = World::new(around(24, 1.0), 2000, 0.5, 0.3, 4);
-    // Pairs within each of three parts, and of the third with the first.
+    // Pairs within each of three parts, and between the third and the first.
     let part = |photo: u32| [16, 20, 24].iter().position(|end| photo < *end).expect("a part");
     let pairs = |keep: &dyn Fn([usize; 2]) -> bool| -> Vec<PairMatches> {
         let kept = world.pairs.iter().filter(|pair| keep(pair.photos.map(part)));
@@ -116,8 +116,8 @@ fn a_model_is_completed_and_another_beside_it_stays() {
     assert!(seen.auc(&found, 1.0) > 90.0, "{}", seen.auc(&found, 1.0));
 }
 
-/// A wavy wall before `photos` cameras 9 degrees apart, every look of which four points far from each other share: its points, its photographs with their
-/// features, and the point of each keypoint.
+/// A wavy wall in front of `photos` cameras 9 degrees apart, on which each descriptor is shared by four points far from each other: its
+/// points, its photographs with their features, and the point of each keypoint.
 fn wall_of_look_alikes(photos: usize) -> (Vec<DVec3>, Vec<PhotoInfo>, Vec<Features>, Vec<Vec<usize>>) {
     let mut rng = Rng::new(5, 0);
     let wall: Vec<DVec3> = (0..400)
@@ -237,7 +237,7 @@ fn look_alikes_match_along_the_lines_of_known_poses() {
     observations.dedup();
     assert_eq!(observations.len(), all, "an observation is of one point");
 
-    // Without a third photograph nothing tells look-alikes on a line apart.
+    // Without a third photograph, look-alikes on a line cannot be told apart.
     let mut two = Model {
         poses: before.poses[..2].to_vec(),
         ..before.clone()
@@ -246,7 +246,7 @@ fn look_alikes_match_along_the_lines_of_known_poses() {
     assert_eq!(two.points, before.points);
 }
 
-/// A world of which every photograph has the same `still` keypoints in the same places, matched in all pairs.
+/// A world in which every photograph has the same `still` keypoints at the same positions, matched in all pairs.
 fn behind_glass(still: usize) -> World {
     let mut world = World::new(around(24, 1.0), 1500, 0.5, 0.2, 1);
     let mut rng = Rng::new(11, 0);
@@ -287,7 +287,7 @@ fn poses_follow_what_moves_and_not_what_stands_still() {
     assert!(same_place(&clean.photos, &clean.features, &clean.pairs).is_empty());
 }
 
-/// Of cameras that only step aside, another focal length is another depth.
+/// For cameras that only move sideways, another focal length is equivalent to another depth.
 #[test]
 fn cameras_that_turn_determine_a_focal_length() {
     for turn in [true, false] {
@@ -404,7 +404,7 @@ fn photographs_of_a_rig_have_one_place_and_their_turns() {
             assert!((face.rotation * DVec3::ONE - faces[0].rotation * mount * DVec3::ONE).length() < 1e-9);
         }
     }
-    // Common places are what makes them accurate.
+    // The common position makes them more accurate.
     let auc = alone.auc(model, 1.0);
     alone.photos.iter_mut().for_each(|photo| photo.mount = None);
     let apart = alone.map();
@@ -531,7 +531,8 @@ fn poison_in_keypoints_and_metadata_does_no_harm() {
     );
 }
 
-/// Photographs around a can with two equal labels on opposite sides. `background` points of the ground, and as many of the wall, have no twin.
+/// Photographs around a can with two equal labels on opposite sides. `background` points of the ground, and as many of the wall, have no
+/// twin.
 fn can_with_equal_labels(photos: usize, background: usize) -> World {
     let mut rng = Rng::new(10, 4);
     let mut uniform = move |low: f64, high: f64| low + (high - low) * f64::from(rng.uniform());
@@ -616,7 +617,7 @@ fn known_distances_bring_a_model_to_metres_with_an_error_that_holds() {
         };
         length(1, 9) / world.poses[1].position.distance(world.poses[9].position)
     };
-    // One, of which only the poses tell how good it is; neighbours tell less than those across.
+    // A single distance, whose error only the poses determine; between neighbours it is less certain than between opposite cameras.
     let (mut near, mut across) = (model.clone(), model.clone());
     let near_fit = to_distances(&mut near, &world.photos, &[distance(3, 4, 1.0)]).expect("posed");
     let across_fit = to_distances(&mut across, &world.photos, &[distance(3, 11, 1.0)]).expect("posed");
@@ -632,7 +633,7 @@ fn known_distances_bring_a_model_to_metres_with_an_error_that_holds() {
         "{}",
         scale_of(&across)
     );
-    // Several that disagree by 3 %.
+    // Several distances that disagree by 3 %.
     let mut several = model.clone();
     let known = [distance(0, 8, 1.03), distance(2, 10, 0.97), distance(4, 12, 1.0)];
     let fit = to_distances(&mut several, &world.photos, &known).expect("posed");
@@ -640,7 +641,7 @@ fn known_distances_bring_a_model_to_metres_with_an_error_that_holds() {
         (0.01..0.03).contains(&fit.scale_error) && (scale_of(&several) - 1.0).abs() < 0.03,
         "{fit:?}"
     );
-    // Cameras at one place tell nothing.
+    // Cameras at the same position do not determine the scale.
     let mut turned = model.clone();
     turned.poses[4] = turned.poses[3];
     let before = turned.clone();

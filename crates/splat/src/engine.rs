@@ -2,8 +2,8 @@
 //!
 //! A step never reads single splats, footprints or gradients. It requests a frame, the surfaces in view, the gradients of added
 //! colours: whole lists, which a device can compute where its data resides and return late or in bulk. Code that edits single
-//! splats (initialisation, files) takes the state with [`Engine::state_mut`], rarely; density control, more often, takes what it decides by
-//! with [`Engine::edit_density`].
+//! splats (initialisation, files) runs rarely and takes the whole state with [`Engine::state_mut`]; density control runs more often and
+//! takes only the columns on which it depends, with [`Engine::edit_density`].
 
 use crate::densify::mcmc;
 #[cfg(feature = "gpu")]
@@ -22,9 +22,9 @@ use std::sync::OnceLock;
 
 /// The state of splats in training with the renderer and the gradients of the last frame, on the CPU or on a GPU.
 ///
-/// What has no form on the GPU, frames with added colours or moved splats, brings the state back to the CPU, where it stays.
+/// Frames that the GPU does not support, those with added colours or moved splats, bring the state back to the CPU, where it stays.
 pub struct Engine {
-    /// Empty while that of the GPU is newer.
+    /// Empty while the GPU's state is newer.
     state: OnceLock<SplatState>,
     #[cfg(feature = "gpu")]
     gpu: Option<Box<GpuTraining>>,
@@ -44,7 +44,7 @@ pub struct Engine {
 pub struct Placement {
     /// The camera.
     pub camera: Camera,
-    /// The splats at this time in this view; `None`: those of the state.
+    /// The splats as moved for this time and view; `None` for those of the state.
     pub moved: Option<Splats>,
 }
 
@@ -73,7 +73,7 @@ pub struct Update {
     pub sh_degree: u32,
     /// How gradients become steps.
     pub optimizer: Optimizer,
-    /// Noise on the means of faint splats.
+    /// Noise added to the means of faint splats.
     pub noise: Option<Noise>,
     /// Largest condition number of a covariance.
     pub condition_cap: Option<f32>,
@@ -130,10 +130,10 @@ impl Engine {
         false
     }
 
-    /// What has gone wrong on the device: the state and everything made from it are then unspecified.
+    /// Reports a failure of the device, after which the state and everything derived from it are unspecified.
     ///
     /// # Errors
-    /// When something has.
+    /// When the device has failed.
     pub fn check_device(&self) -> Result<(), DeviceError> {
         #[cfg(feature = "gpu")]
         if let Some(gpu) = &self.gpu {
@@ -143,7 +143,8 @@ impl Engine {
         Ok(())
     }
 
-    /// Splats at most: as many as the largest arrays of a GPU have room for, with as many entries of tiles each as in the frames so far.
+    /// Maximum number of splats: as many as fit in the largest arrays of a GPU, given the last frame's tile entries per splat.
+    /// No limit on the CPU.
     pub fn most_splats(&self) -> usize {
         #[cfg(feature = "gpu")]
         if let Some(gpu) = &self.gpu {
@@ -204,9 +205,9 @@ impl Engine {
         self.state.get_mut().expect("just filled")
     }
 
-    /// Edits the state between two steps as density control does: by geometry, statistics and filter. Harmonics and moments may be
-    /// moved, copied from splat to splat and set to zero, but `edit` must neither read nor change them: on a GPU they stay there,
-    /// and the columns it sees have other values.
+    /// Edits the state between two steps as density control does, based on geometry, statistics and filter. Harmonics and moments may
+    /// be moved, copied from splat to splat and set to zero, but `edit` must neither read their values nor set others: on a GPU they
+    /// stay on the device, and the columns that `edit` sees hold other values.
     pub fn edit_density<R>(&mut self, edit: impl FnOnce(&mut SplatState) -> R) -> R {
         #[cfg(feature = "gpu")]
         if let Some(gpu) = self.gpu.as_mut().filter(|gpu| !gpu.stale) {
@@ -230,7 +231,7 @@ impl Engine {
         self.set_filter();
     }
 
-    /// Gives the renderer of the CPU its filter.
+    /// Passes the filter to the CPU's renderer.
     fn set_filter(&mut self) {
         self.state();
         let filter = if self.filters {
@@ -263,7 +264,8 @@ impl Engine {
         self.renderer.render_within(splats, bounds, view, options);
     }
 
-    /// Begins a frame of the state's splats on the GPU, without waiting for what it finds: until [`Self::settle`], only the device knows.
+    /// Begins a frame of the state's splats on the GPU, without waiting for the numbers of visible splats and of entries: until
+    /// [`Self::settle`], only the device knows them.
     ///
     /// # Panics
     /// When the engine is on the CPU.
@@ -273,8 +275,8 @@ impl Engine {
         self.on_gpu().render_ahead(&ViewParams::new(camera), options);
     }
 
-    /// Waits for the last [`Self::render_ahead`]: whether there was room on the device for it. If not, the frame and what was made from it
-    /// since are void: the backward pass and the update changed nothing, and are to be repeated after another frame.
+    /// Waits for the last [`Self::render_ahead`] and returns whether there was room for it on the device. If not, the frame and everything
+    /// derived from it are void: the backward pass and the update have changed nothing, and must be repeated after another frame.
     #[cfg(feature = "gpu")]
     #[must_use]
     pub fn settle(&mut self) -> bool {
@@ -302,7 +304,7 @@ impl Engine {
             .project_within(splats, bounds, &ViewParams::new(&placement.camera), options);
     }
 
-    /// Brings the bounds of the state's splats up to date, if those are drawn.
+    /// Updates the bounds of the state's splats, if those splats are drawn.
     fn update_bounds(&mut self) {
         if self.moved.is_none() && std::mem::take(&mut self.edited) {
             let renderer = &self.renderer;
@@ -359,8 +361,8 @@ impl Engine {
         self.renderer.intersections()
     }
 
-    /// Splat-pixel pairs visited by blending in the last frame, on a GPU those of whole tiles. Counting walks all tiles: not for every
-    /// step.
+    /// Splat-pixel pairs visited by blending in the last frame; on a GPU, all pixels of each touched tile. Counting walks all tiles, which
+    /// is too slow for every step.
     pub fn pairs(&self) -> u64 {
         #[cfg(feature = "gpu")]
         if let Some(gpu) = &self.gpu {
@@ -379,14 +381,14 @@ impl Engine {
         self.renderer.backward(splats, v_out, &mut self.gradients);
     }
 
-    /// The planes of the last frame on a GPU, and room for those of its gradients, `[3 + 1 + 1 (+ 1), H, W]`: colour, alpha, depth, and the
-    /// error to gather. `None` on the CPU.
+    /// The planes of the last frame on a GPU, and an array for those of its gradients, `[3 + 1 + 1 (+ 1), H, W]`: colour, alpha, depth, and
+    /// the error to gather. `None` on the CPU.
     #[cfg(feature = "gpu")]
     pub fn device_frame(&mut self) -> Option<[&Array; 2]> {
         self.gpu.as_mut().map(|gpu| gpu.frame_and_gradients())
     }
 
-    /// As [`Self::backward`], of the gradients written to [`Self::device_frame`].
+    /// As [`Self::backward`], with the gradients written to [`Self::device_frame`].
     ///
     /// # Panics
     /// When the engine is on the CPU.
@@ -404,7 +406,7 @@ impl Engine {
         self.gradients.non_finite
     }
 
-    /// Gradient of the camera, if the last backward pass was asked for it.
+    /// Gradient of the camera, if the last backward pass computed it.
     pub fn camera_gradient(&self) -> Option<CameraGradient> {
         #[cfg(feature = "gpu")]
         if let Some(gpu) = &self.gpu {
@@ -483,7 +485,7 @@ impl Engine {
         if let Some(limit) = update.condition_cap {
             regularize::cap_condition(&mut state.splats, limit);
         }
-        // Splats only shrink, so that their bounds hold.
+        // Splats only shrink, so that their bounds remain valid.
         if let Some(cap) = &update.angle_cap {
             regularize::cap_angle(&mut state.splats, cap);
         }

@@ -13,7 +13,7 @@ pub struct InitOptions {
     pub opacity: f32,
     /// Factor on the neighbour distance, which is the initial size; 1 in 3DGS.
     pub scale: f32,
-    /// SH degree for which there is room.
+    /// SH degree of the splats.
     pub sh_degree: u32,
 }
 
@@ -79,14 +79,15 @@ pub enum PixelClass {
 }
 
 /// At most `count` points in the cameras' frusta, for scenes without points. `depth_bounds[i]` holds the nearest and farthest
-/// depth of view i's scene, where known; otherwise depths are taken around the point that the cameras focus on.
+/// depth of view i's scene, where known; otherwise depths are drawn around that of the point on which the cameras focus.
 ///
 /// Points are drawn along rays of random pixels, uniformly in inverse depth, and kept with a probability that grows with the
 /// fraction of cameras that see them, so that they concentrate where views overlap. `open(view)` opens a photograph and
-/// returns the content of its pixels; photographs are opened one after the other, in one or a few passes over all of them. A point that is transparent in any camera is outside the visual hull (Laurentini 1994) and is discarded; so is one
-/// that is masked in more cameras than not, since training would never remove it. A point's colour is the mean over the
-/// cameras that see it: correct if it lies on a surface, and elsewhere never so dark that the clamp of negative colours
-/// prevents it from learning.
+/// returns the content of its pixels; photographs are opened one after the other, in one or a few passes over all of them. A
+/// point that is transparent in any camera is outside the visual hull (Laurentini 1994) and is discarded; so is one that is
+/// masked in more cameras than not, since training would never remove it. A point's colour is the mean over the cameras that
+/// see it: correct if it lies on a surface, and elsewhere never so dark that the clamp of negative colours prevents it from
+/// learning.
 ///
 /// # Errors
 /// Those of `open`.
@@ -153,14 +154,14 @@ struct Candidate {
     chance: f32,
     seen: u32,
     masked: u32,
-    /// Of the colours in the cameras that see it.
+    /// Sum of its colours in the cameras that see it.
     sum: [u32; 3],
     /// Whether it is transparent in a camera.
     is_outside: bool,
 }
 
 impl Candidate {
-    /// Adds what `camera`, whose photograph has `content`, sees of it.
+    /// Adds the observation by `camera`, whose photograph has `content`.
     fn look_from(&mut self, camera: &Camera, content: &impl Fn(Vec2) -> PixelClass) {
         if self.is_outside {
             return;

@@ -1,4 +1,5 @@
-//! Fewer splats that look alike from afar: pairs are merged into splats of the same mass, mean and covariance, the cheapest first.
+//! Fewer splats that look the same from a distance: pairs are merged into splats of the same mass, mean and covariance, the cheapest
+//! pairs first.
 //!
 //! The mass is opacity times the area of the ellipsoid's surface (Kerbl et al. 2024, "A Hierarchical 3D Gaussian Representation",
 //! section 4.1), not times its volume as in [`densify::merge`](crate::densify::merge): two flat splats that are not quite in one plane
@@ -10,12 +11,12 @@ use crate::{Splats, eigen, logit};
 use glam::{Mat3, Quat, Vec3};
 use rayon::prelude::*;
 
-/// Neighbours among which a partner is sought.
+/// Number of nearest neighbours considered as partners, the splat itself included.
 const NEIGHBOURS: usize = 9;
 /// Largest opacity of a merged splat.
 const MOST_OPAQUE: f32 = 0.999;
 
-/// A splat as merging sees it.
+/// The properties of a splat that matter for merging.
 #[derive(Clone, Copy)]
 struct Blob {
     mean: Vec3,
@@ -25,7 +26,7 @@ struct Blob {
     color: Vec3,
 }
 
-/// `splats` merged until at most `count` are left. Splats that can never be seen are left out first.
+/// Merges `splats` until at most `count` are left. Splats that can never be visible are removed first.
 pub fn merged(splats: &Splats, count: usize) -> Splats {
     let drawn: Vec<u32> = (0..splats.len() as u32)
         .into_par_iter()
@@ -78,7 +79,7 @@ fn pairs(blobs: &[Blob], most: usize) -> Vec<(u32, u32)> {
         .flat_map_iter(|i| {
             let near = tree.of::<NEIGHBOURS>(positions[i]);
             let others = near.into_iter().map(|(_, other)| other as usize);
-            // Pairs that find each other are there twice, which does no harm.
+            // Mutual neighbours give the same pair twice, which does no harm.
             others
                 .filter(move |other| *other != i && *other < blobs.len())
                 .map(move |other| (cost(&blobs[i], &blobs[other]), i.min(other) as u32, i.max(other) as u32))
@@ -100,16 +101,16 @@ fn pairs(blobs: &[Blob], most: usize) -> Vec<(u32, u32)> {
     pairs
 }
 
-/// What merging two costs: how far their mass moves (Ward 1963), more where the colours differ.
+/// The cost of merging two splats: how far their mass moves (Ward 1963), more if their colours differ.
 fn cost(a: &Blob, b: &Blob) -> f32 {
     let reduced = a.mass * b.mass / (a.mass + b.mass);
     reduced * a.mean.distance_squared(b.mean) * (COLOR_FLOOR + a.color.distance_squared(b.color))
 }
 
-/// Squared difference of colours, in coefficients of degree 0, that costs as much again as the distance.
+/// Squared difference of colours, in coefficients of degree 0, that doubles the cost of the distance.
 const COLOR_FLOOR: f32 = 0.1;
 
-/// Both of each pair as one, and the others as they are.
+/// Replaces each pair by its union; keeps the other splats.
 fn unite(splats: &Splats, blobs: &[Blob], pairs: &[(u32, u32)]) -> Splats {
     let mut gone = vec![false; splats.len()];
     pairs.iter().for_each(|(_, b)| gone[*b as usize] = true);
@@ -138,7 +139,7 @@ fn unite(splats: &Splats, blobs: &[Blob], pairs: &[(u32, u32)]) -> Splats {
     united.gather(&kept)
 }
 
-/// Share of `a` in the mass, mean, rotation, ln scales and opacity logit of both as one.
+/// The union of two splats: `a`'s share of the mass, then the union's mean, rotation, ln scales and opacity logit.
 fn union(a: &Blob, b: &Blob) -> (f32, Vec3, Quat, [f32; 3], f32) {
     let total = a.mass + b.mass;
     let part = a.mass / total;

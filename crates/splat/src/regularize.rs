@@ -31,8 +31,8 @@ impl Regularizers {
         *self == Self::default()
     }
 
-    /// Weights of a splat's own opacity, its square, the sum of its standard deviations and that of their fourth powers, where lengths
-    /// are in world units and averages weigh it by `per_splat`.
+    /// Weights of a splat's own opacity, its square, the sum of its standard deviations and that of their fourth powers, with lengths in
+    /// world units and a weight of `per_splat` for each splat in the averages.
     pub(crate) fn per_splat(&self, unit: f64, per_splat: f64) -> [f64; 4] {
         [
             f64::from(self.opacity) * per_splat,
@@ -100,7 +100,7 @@ pub fn add_gradients(
         });
 }
 
-/// Of one chunk of splats.
+/// [`add_gradients`] for one chunk of splats.
 struct AddGradients<'a> {
     splats: &'a Splats,
     weights: &'a Regularizers,
@@ -212,20 +212,20 @@ fn for_each_size(log_scales: &mut Planes, change: impl Fn(usize, [&mut f32; 3]) 
 /// How large a splat may be, as seen from a camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AngleCap {
-    /// The camera, world.
+    /// Position of the camera, world.
     pub center: [f32; 3],
     /// Largest standard deviation, relative to the distance from the camera.
     pub largest: f32,
 }
 
-/// In photographs of wide lenses, which are not cut into faces. A footprint is the affine approximation of what a lens or a pinhole makes of a splat,
-/// and they differ where the splat is large: photographs of a fisheye then look right, and a pinhole shows veils. `synth`'s room by a fisheye of 190
-/// degrees, held-out views by a pinhole, 1,500 steps: 32.3 dB without a cap, 36.2, 37.3 and 38.0 with 0.25, 0.15 and 0.1; antialiased 39.3 with 0.1,
-/// 39.7 with 0.05.
+/// [`AngleCap::largest`] for photographs of wide lenses that are not cut into faces. A footprint is the affine approximation of a splat's
+/// projection, and the approximations for a lens and for a pinhole differ where the splat is large: renders through a fisheye then look
+/// right, and those through a pinhole show veils. `synth`'s room by a fisheye of 190 degrees, held-out views by a pinhole, 1,500 steps:
+/// 32.3 dB without a cap, 36.2, 37.3 and 38.0 with 0.25, 0.15 and 0.1; antialiased 39.3 with 0.1, 39.7 with 0.05.
 const LARGEST_OF_WIDE: f32 = 0.1;
 
 impl AngleCap {
-    /// That of a step whose photograph is by `camera`; `None` unless its lens is wide.
+    /// The cap for a step whose photograph was taken by `camera`; `None` unless its lens is wide.
     pub fn of(camera: &Camera) -> Option<Self> {
         camera.intrinsics.lens.is_wide().then(|| Self {
             center: camera.pose.position.to_array(),
@@ -240,7 +240,7 @@ pub fn cap_angle(splats: &mut Splats, cap: &AngleCap) {
     for_each_size(&mut splats.log_scales, |i, sizes| {
         let square: f32 = (0..3).map(|c| (means.get(c, i) - cap.center[c]).powi(2)).sum();
         let largest = 0.5 * square.ln() + of_distance;
-        // What is at the camera itself has no size to which it could be limited.
+        // A splat at the camera itself has no finite limit.
         for v in sizes {
             if largest.is_finite() && *v > largest {
                 *v = largest;
@@ -249,7 +249,7 @@ pub fn cap_angle(splats: &mut Splats, cap: &AngleCap) {
     });
 }
 
-/// The size from which on splats are among the largest `fraction` of `sizes`; `None` if all are.
+/// Minimum size of the largest `fraction` of `sizes`; `None` if that is all of them.
 pub(crate) fn size_limit(mut sizes: Vec<f32>, fraction: f32) -> Option<f32> {
     let frozen = ((1.0 - fraction) * sizes.len() as f32).round() as usize;
     if frozen == 0 || sizes.is_empty() {
@@ -277,7 +277,7 @@ pub fn freeze_small(splats: &Splats, fraction: f32, of: Regularized, gradients: 
     let Some(limit) = size_limit(sizes, fraction) else {
         return;
     };
-    // One byte a splat: reading three planes of sizes for each of ten planes of gradients takes longer.
+    // One byte per splat: reading three planes of sizes for each of ten planes of gradients takes longer.
     let mut small = vec![false; n];
     let counts = &gradients.counts;
     let has_gradients = |chunk: usize| of == Regularized::All || counts[chunk] > 0;

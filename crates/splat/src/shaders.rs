@@ -1,4 +1,4 @@
-//! The kernels, put together from their parts: their text for whoever runs WGSL, such as a browser, and compiled for the GPU.
+//! The kernels, assembled from their parts: as text for anything that runs WGSL, such as a browser, and compiled for the GPU.
 
 use irradia_compute::shaders::{ADAM, GRID, HARMONICS, SCAN, SORT, Shader};
 
@@ -21,9 +21,9 @@ irradia_compute::kernels! {
     count: [GRID, VIEW],
     /// Twin: `render::bin`, with `ranges` and `segments`.
     emit: [GRID, VIEW, TILES],
-    /// Where the entries of each tile are.
+    /// The range of each tile's entries.
     ranges: [GRID, VIEW],
-    /// Segments of each tile.
+    /// Number of segments of each tile.
     segments: [GRID, VIEW],
     /// Twin: `render::blend::BlendTile`.
     blend: [GRID, VIEW, FRAGMENT],
@@ -31,7 +31,7 @@ irradia_compute::kernels! {
     blend_vjp: [GRID, VIEW, FRAGMENT],
     /// Twin: `render::project::project_vjp`.
     project_vjp: [GRID, VIEW, GEOMETRY, LOAD, HARMONICS, DIRECTION],
-    /// Of the camera's gradient, which the CPU sums up splat by splat.
+    /// Sums of the camera's gradient over groups of splats; the CPU accumulates it splat by splat.
     sum_camera: [GRID, VIEW],
     /// Twin: `SplatState::step`, the colours' part.
     update_harmonics: [GRID, VIEW, UPDATE, ADAM, HARMONICS, DIRECTION],
@@ -41,18 +41,18 @@ irradia_compute::kernels! {
     move_rows: [GRID],
 }
 
-/// A stage of a training step: what the CPU does in one function or two.
+/// A stage of a training step, which is one function or a few on the CPU.
 #[derive(Clone, Copy, Debug)]
 pub struct Stage {
     /// Its name.
     pub name: &'static str,
     /// Its own kernels, in order; prefix sums and sorts come between them.
     pub kernels: &'static [&'static str],
-    /// The same on the CPU, in this crate.
+    /// The functions of this crate that do the same on the CPU.
     pub twin: &'static str,
 }
 
-/// The stages in their order. Tests run the GPU from any of them on, with the twin's results before it, so that an error is found at its
+/// The stages in order. Tests run the GPU from each stage on, with the twin's results as its input, so that an error is located at its
 /// stage (`gpu/bisect.rs`).
 pub const STAGES: [Stage; 6] = [
     Stage {
@@ -87,7 +87,7 @@ pub const STAGES: [Stage; 6] = [
     },
 ];
 
-/// Kernels of [`SHADERS`] that make a frame.
+/// Kernels of [`SHADERS`] that render a frame.
 const FRAME: [&str; 7] = ["project", "compact", "count", "emit", "ranges", "segments", "blend"];
 
 /// The source of every kernel of a frame, with those of prefix sums and of the sort.

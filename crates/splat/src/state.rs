@@ -35,7 +35,7 @@ pub enum Statistics {
 /// Adam's options in one step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Optimizer {
-    /// Its constants.
+    /// Constants of Adam.
     pub step: AdamStep,
     /// Whether splats without a gradient, such as those out of view, step with a gradient of zero (3DGS); otherwise they keep
     /// parameters and moments.
@@ -47,8 +47,8 @@ pub struct Optimizer {
 pub struct Rates {
     /// Of the means, world units per step.
     pub means: f32,
-    /// The camera of the last frame, world: where it is given, `means` is relative to the distance of each splat from it, so that a step looks as
-    /// large wherever a splat is.
+    /// Position of the last frame's camera, world. If given, `means` is relative to each splat's distance from it, so that a step has the
+    /// same size on screen at any distance.
     pub means_from: Option<[f32; 3]>,
     /// Of the raw quaternions.
     pub quats: f32,
@@ -63,7 +63,7 @@ pub struct Rates {
 }
 
 impl Rates {
-    /// All of them times `factor`.
+    /// All rates times `factor`.
     pub fn scaled(self, factor: f32) -> Self {
         Self {
             means: self.means * factor,
@@ -169,7 +169,7 @@ impl SplatState {
         splats.chain([&self.statistics, &self.filter]).collect()
     }
 
-    /// The same, to be changed.
+    /// The same, mutable.
     fn all_columns_mut(&mut self) -> Vec<&mut Planes> {
         let [first, second] = &mut self.moments;
         let splats = [&mut self.splats, first, second]
@@ -322,7 +322,7 @@ impl SplatState {
     }
 }
 
-/// Distance of every item of `means` from `center`, world units, as long as the stride.
+/// Distance of every item of `means` from `center`, world units, with padding up to the stride.
 fn distances(means: &Planes, center: [f32; 3]) -> Vec<f32> {
     let mut distances = vec![0.0; means.stride()];
     let [x, y, z] = [0, 1, 2].map(|c| means.plane(c).par_chunks(CHUNK));
@@ -448,7 +448,7 @@ mod tests {
         assert!(!copy.has_room_for(&SplatState::new(Splats::zeros(33, 2))));
     }
 
-    /// A round against its definition, one splat at a time, with 1 and with 2 threads.
+    /// Compares a round with its definition, one splat at a time, with 1 and with 2 threads.
     #[test]
     fn a_round_in_place_gives_what_splat_by_splat_gives_with_any_number_of_threads() {
         let (n, degree) = (40_000, 1);
@@ -470,7 +470,7 @@ mod tests {
         let kept: Vec<u32> = (0..n as u32).filter(|i| i % 7 != 3).collect();
         let reset: Vec<u32> = (0..n as u32).step_by(70).collect();
 
-        // Source of each new splat: part and index; Morton codes as `morton_order` has them.
+        // Source of each new splat: part and index. The Morton order is that of `morton_order`.
         let mut sources: Vec<(usize, usize)> = kept.iter().map(|i| (0, *i as usize)).collect();
         sources.extend((0..700).map(|i| (1, i)).chain((0..90).map(|i| (2, i))));
         let parts = [&before.splats, &added[0], &added[1]];

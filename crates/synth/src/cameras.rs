@@ -7,7 +7,7 @@ use std::f32::consts::TAU;
 /// How the cameras of a scene are placed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rig {
-    /// Where they are and where they look.
+    /// Where the cameras are and where they look.
     pub path: Path,
     /// Horizontal field of view, radians.
     pub fov_x: f32,
@@ -27,13 +27,13 @@ pub enum Path {
         /// How far each camera's target deviates along each axis.
         aside: f32,
     },
-    /// In a plane before a target, facing forward along +Y.
+    /// In a plane in front of a target, facing forward along +Y.
     Before {
         /// The cameras' approximate target.
         target: Vec3,
         /// Distance of the plane.
         distance: f32,
-        /// Half the width and half the height of the part of the plane in which they are.
+        /// Half the width and half the height of the part of the plane that contains the cameras.
         half: Vec2,
     },
     /// On an ellipse about the z axis, each looking across it.

@@ -10,18 +10,18 @@ use glam::{Vec2, Vec3};
 use irradia_scene::{Camera, Dataset, FirstSide, Photo, PointCloud, Rng, RollingShutter, View};
 use std::sync::Arc;
 
-/// Most samples per pixel.
+/// Maximum number of samples per pixel.
 const SAMPLES: u32 = 16;
 /// Number of points over all training views.
 const POINTS: u32 = 6000;
 /// Standard deviation of a point's error as a fraction of its distance, as for structure from motion on good photographs.
 const POINT_ERROR: f32 = 0.001;
 
-/// Pixels to each side of a point among which structure from motion looks for contrast.
+/// Pixels on each side of a point in the patch in which structure from motion looks for contrast.
 const PATCH: u32 = 2;
-/// Depth from which points are not triangulated, world units: cameras a few metres apart see no parallax.
+/// Depth beyond which points are not triangulated, world units: cameras a few metres apart see no parallax.
 const FAR: f32 = 100.0;
-/// Least contrast of such a patch, largest less smallest green in \[0, 1\]: a plain wall has less.
+/// Minimum contrast of such a patch, the largest minus the smallest green in \[0, 1\]: a plain wall has less.
 const CONTRAST: f32 = 0.06;
 
 /// Options of a dataset.
@@ -31,18 +31,18 @@ pub struct SynthOptions {
     pub scene: SceneName,
     /// Training views, 3 to 1000; one more in eight is held out, one more in twenty is for validation.
     pub views: u32,
-    /// Size along this axis in pixels, 8 to 4096.
+    /// Width in pixels, 8 to 4096.
     pub width: u32,
-    /// Size along this axis in pixels, 8 to 4096.
+    /// Height in pixels, 8 to 4096.
     pub height: u32,
     /// Random seed of cameras, samples and points, and of layout and colours of all scenes but the demo: equal seeds give equal
     /// views.
     pub seed: u64,
-    /// The lens of the training and validation views. Held-out views are always by a pinhole, so that lenses can be compared, and of a size at
-    /// which they have as many pixels an angle.
+    /// The lens of the training and validation views. Held-out views always have a pinhole, so that lenses can be compared, and a size that
+    /// gives them the same number of pixels per angle.
     pub lens: SynthLens,
-    /// By how much the camera of a training or validation view turns while it is read out from top to bottom, radians; it moves by as much, world
-    /// units a radian, both in directions of their own. Held-out views are by a camera at rest.
+    /// Angle by which the camera of a training or validation view turns during the readout from top to bottom, radians. It also moves, by
+    /// one world unit per radian; each view has its own directions. The camera of a held-out view is at rest.
     pub turn: f32,
 }
 
@@ -84,7 +84,7 @@ pub struct Shot {
     pub number: u32,
     /// The camera.
     pub camera: Camera,
-    /// Seed of the samples. It differs between views, lest the noise form a pattern fixed to the image.
+    /// Seed of the samples. It differs between views, so that the noise does not form a pattern fixed to the image.
     seed: u64,
 }
 
@@ -108,7 +108,7 @@ impl Capture {
     /// Places the cameras; nothing is traced yet.
     ///
     /// # Errors
-    /// When a count or a size of `options` is out of its range.
+    /// When a value of `options` is out of range.
     pub fn new(options: &SynthOptions) -> Result<Self, SynthError> {
         let SynthOptions {
             scene,
@@ -224,7 +224,7 @@ impl Capture {
 /// Traces the training and held-out views in memory: the same dataset as the one read from its files.
 ///
 /// # Errors
-/// When a count or a size of `options` is out of its range.
+/// When a value of `options` is out of range.
 pub fn dataset(options: &SynthOptions) -> Result<Dataset, SynthError> {
     let capture = Capture::new(options)?;
     let mut dataset = Dataset {
@@ -256,7 +256,7 @@ pub fn dataset(options: &SynthOptions) -> Result<Dataset, SynthError> {
     Ok(dataset)
 }
 
-/// A camera that turns by `turn` in some direction while it is read out, and moves.
+/// A camera that turns by `turn` and moves during the readout, both in random directions.
 fn moving(turn: f32, rng: &mut Rng) -> RollingShutter {
     let mut direction = || Vec3::new(rng.normal(), rng.normal(), rng.normal()).normalize_or(Vec3::X);
     RollingShutter {

@@ -22,13 +22,13 @@ pub enum SynthLens {
     Equirectangular,
 }
 
-/// There is no lens of this name.
+/// An unknown name of a lens.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("no lens is called `{0}`; there are pinhole, fisheye, equirectangular")]
+#[error("unknown lens `{0}`; use pinhole, fisheye or equirectangular")]
 pub struct UnknownLens(String);
 
 impl SynthLens {
-    /// All of them.
+    /// All lenses.
     pub const ALL: [Self; 3] = [Self::Pinhole, Self::Fisheye, Self::Equirectangular];
 
     fn name(self) -> &'static str {

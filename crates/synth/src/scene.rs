@@ -18,7 +18,7 @@ pub struct Material {
 }
 
 impl Material {
-    /// Scatters light only.
+    /// A material that only scatters light.
     pub(crate) fn matte(texture: Texture) -> Self {
         Self {
             texture,
@@ -28,7 +28,7 @@ impl Material {
         }
     }
 
-    /// Under a clear coat.
+    /// A material under a clear coat.
     pub(crate) fn glazed(texture: Texture, coat: f32, roughness: f32) -> Self {
         Self {
             texture,
@@ -38,7 +38,7 @@ impl Material {
         }
     }
 
-    /// Reflects light only.
+    /// A material that only reflects light.
     pub(crate) fn metal(color: Vec3, roughness: f32) -> Self {
         Self {
             texture: Texture::Plain(color),
@@ -93,7 +93,7 @@ pub struct SynthScene {
     pub surroundings: Vec<Object>,
     /// Everything else.
     pub clusters: Vec<Cluster>,
-    /// What illuminates it.
+    /// The light that illuminates the scene.
     pub light: Light,
 }
 

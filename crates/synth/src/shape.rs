@@ -1,4 +1,4 @@
-//! The solids of the demo scene and their intersection with rays.
+//! The solids of the scenes and their intersection with rays.
 //!
 //! Symbols: a ray is `o + t d` with unit `d`; `t` is in world units.
 

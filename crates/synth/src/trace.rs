@@ -28,7 +28,7 @@ const EXPOSURE: f32 = 0.46;
 pub struct SynthFrame {
     /// `[H, W, 3]` sRGB in \[0, 1\].
     pub color: Image,
-    /// Depth along the camera's +Z of the first hit through each pixel centre, `[H, W]`, world units; the distance where the lens is wide.
+    /// Depth along the camera's +Z of the first hit through each pixel centre, `[H, W]`, world units; for wide lenses, the distance.
     pub depth: Image,
     /// Unit normals at the same points, facing the camera, `[H, W, 3]` world.
     pub normals: Image,
@@ -83,7 +83,7 @@ impl SynthScene {
 
     /// sRGB colour of the pixel with upper left `corner`, from at most `side^2` samples.
     fn pixel(&self, camera: &Camera, corner: Vec2, side: u32, rng: &mut Rng) -> Vec3 {
-        // Adaptive sampling: four samples that agree suffice for most pixels.
+        // Adaptive sampling: nine samples that agree suffice for most pixels.
         if side > 3 {
             let (mean, spread) = self.sampled(camera, corner, 3, rng);
             if spread < PLAIN {
@@ -200,7 +200,7 @@ impl SynthScene {
     }
 }
 
-/// What the depth of [`SynthFrame`] is to a distance of 1 along the unit `direction`.
+/// The depth, as in [`SynthFrame`], of a point at distance 1 along the unit `direction`.
 pub(crate) fn depth_per_distance(camera: &Camera, direction: Vec3) -> f32 {
     if camera.intrinsics.lens.is_wide() {
         1.0

@@ -1,4 +1,4 @@
-/// The largest difference of two arrays.
+/// The largest difference between two arrays.
 #[derive(Clone, Copy, Debug)]
 pub struct Difference {
     /// The difference, absolute or relative depending on the function.

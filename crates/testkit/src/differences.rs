@@ -1,4 +1,4 @@
-//! Gradients against central differences in double precision.
+//! Compares gradients with central differences in double precision.
 
 use irradia_scene::Rng;
 
@@ -30,7 +30,7 @@ impl Differences {
     /// Checks the coordinates `which` of the gradient `v` of `value` at `at`; `at` may be longer than `v`.
     ///
     /// # Panics
-    /// When one is out of tolerance.
+    /// When a difference is out of tolerance.
     pub fn check(
         &self,
         what: &str,
@@ -69,7 +69,7 @@ pub fn some_of(n: usize) -> impl Iterator<Item = usize> {
 /// and a step is `step` times a normal variate in each coordinate.
 ///
 /// # Panics
-/// When one is out of tolerance.
+/// When a difference is out of tolerance.
 pub fn directional(at: &[f64], v: &[f64], value: impl Fn(&[f64]) -> f64, step: f64, tolerance: f64) {
     assert_eq!(at.len(), v.len(), "the gradient matches the input's length");
     let length = v.iter().map(|v| v * v).sum::<f64>().sqrt();

@@ -1,6 +1,6 @@
 use std::fmt::Display;
 
-/// The GPU on which tests run; where `open` finds none they are skipped, loudly, and fail if `IRRADIA_REQUIRE_GPU` is set.
+/// The GPU that a test runs on. If `open` finds none, the test reports that it is skipped, or fails if `IRRADIA_REQUIRE_GPU` is set.
 ///
 /// # Panics
 /// When a GPU is required and there is none.
@@ -15,7 +15,7 @@ pub fn gpu_or_skip<G, E: Display>(open: impl FnOnce() -> Result<G, E>) -> Option
     }
 }
 
-/// Checks a shader as every implementation does; needs no GPU.
+/// Validates a shader as every implementation does; needs no GPU.
 ///
 /// # Panics
 /// With its name and the reason, when it is not valid WGSL.
@@ -24,7 +24,7 @@ pub fn validate_shader(name: &str, source: &str) {
         naga::front::wgsl::parse_str(source).unwrap_or_else(|error| panic!("{name}: {}", error.emit_to_string(source)));
     let mut validator = naga::valid::Validator::new(
         naga::valid::ValidationFlags::all(),
-        // `unpack2x16float` belongs to WGSL itself.
+        // `unpack2x16float` is part of core WGSL.
         naga::valid::Capabilities::default() | naga::valid::Capabilities::SHADER_FLOAT16_IN_FLOAT32,
     );
     if let Err(error) = validator.validate(&module) {

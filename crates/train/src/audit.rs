@@ -1,4 +1,4 @@
-//! Looks at all training views during a run: which photographs do not fit, and what stands in one of them only.
+//! Examines all training views during a run: which photographs do not fit the others, and what only one of them shows.
 
 use crate::event::Event;
 use crate::schedule::plan;
@@ -8,14 +8,14 @@ use irradia_splat::FramePlanes;
 
 /// Fraction of a run after which misfits are left out.
 const MISFITS_AT: f64 = 0.2;
-/// Fractions of a run after which transients are hidden. After 0.2, surfaces at the border of a scene are not learned yet and are taken for
-/// transients; later ones find the borders of what the first found.
+/// Fractions of a run after which transients are hidden. At 0.2, surfaces at the border of a scene are not learned yet and are taken for
+/// transients; the later searches find the borders of what the first one found.
 const TRANSIENTS_AT: [f64; 3] = [0.3, 0.45, 0.6];
-/// Steps of a run for each training view below which nothing is decided: the renders would cost more than a twentieth of it.
+/// Minimum number of a run's steps per training view for any decision: with fewer, the renders would cost more than a twentieth of the run.
 const STEPS_PER_VIEW: usize = 8;
 
 impl Trainer {
-    /// What is due after a step that began at `before`, in steps of the recipe: leaves out photographs, hides parts of them.
+    /// Does what is due after a step that began at `before`, in steps of the recipe: leaves out misfits, hides transients.
     pub(crate) fn audit(&mut self, before: f64) -> Result<Vec<Event>, TrainError> {
         let (total, now) = (self.recipe.total_steps() as f64, self.clock.time);
         let passes = |at: f64| before < at * total && now >= at * total;
@@ -28,7 +28,7 @@ impl Trainer {
             events.extend(self.leave_out_misfits(&errors));
         }
         if self.recipe.hide_transients && TRANSIENTS_AT.into_iter().any(passes) {
-            // Where the first look finds nothing, there is nothing.
+            // If the first search finds nothing, there are no later ones.
             let is_first = passes(TRANSIENTS_AT[0]);
             if is_first || self.hidden.views() > 0 {
                 self.find_transients()?;
@@ -38,7 +38,7 @@ impl Trainer {
         Ok(events)
     }
 
-    /// The error of each training view, and that of its better part.
+    /// The error of each training view over all pixels, and over the pixels that fit best.
     fn training_errors(&mut self) -> Result<Vec<(usize, [f64; 2])>, TrainError> {
         let plan = plan(&self.recipe, &self.clock);
         let mut errors = Vec::with_capacity(self.trained.len());
@@ -67,7 +67,7 @@ impl Trainer {
     fn hidden_event(&self) -> Event {
         let (views, share) = (self.hidden.views(), 100.0 * self.hidden.share());
         let message = format!(
-            "{views} of {} photographs show what the others do not (people, cars, shadows), {share:.0} % of each in the mean; it is hidden from training (--set hide_transients=false shows it)",
+            "{views} of {} photographs show what the others do not (people, cars, shadows), on average {share:.0} % of each; it is hidden from training (--set hide_transients=false shows it)",
             self.trained.len()
         );
         Event::Decided { message }

@@ -34,9 +34,9 @@ const FORMAT_4: &str = "irradia-checkpoint-4";
 const FIELD: &str = "field.";
 /// The time breakdown; absent from earlier checkpoints.
 const TIMES: &str = "times";
-/// Views to train on, where misfits are left out.
+/// Views to train on; absent if no misfits were left out.
 const TRAINED: &str = "trained_views";
-/// View and block of what is hidden as transient.
+/// View and block of each block that is hidden as transient.
 const HIDDEN: &str = "hidden_blocks";
 const OWNERS: [&str; 3] = ["splats", "first_moments", "second_moments"];
 
@@ -51,7 +51,7 @@ pub struct Checkpoint<'a> {
 }
 
 impl<'a> Checkpoint<'a> {
-    /// Of `trainer` as it is.
+    /// The checkpoint of `trainer` in its current state.
     pub fn of(trainer: &'a Trainer) -> Self {
         let mut others: Vec<NamedTensor> = Vec::new();
         let mut keep = |prefix: &str, owned: Vec<NamedTensor>| {
@@ -118,7 +118,7 @@ impl<'a> Checkpoint<'a> {
         self.state.bytes() as u64
     }
 
-    /// With a copy of the splats, in the memory of `spare`.
+    /// The same checkpoint with a copy of the splats, in the memory of `spare`.
     pub fn copied_into(&self, mut spare: SplatState) -> Checkpoint<'static> {
         spare.copy_from(&self.state);
         Checkpoint {
@@ -133,7 +133,7 @@ impl<'a> Checkpoint<'a> {
     /// piece by piece as they are written.
     ///
     /// # Errors
-    /// Those of `out`.
+    /// The errors of `out`.
     pub fn write(&self, out: &mut (impl Write + ?Sized)) -> io::Result<()> {
         let state = &*self.state;
         let mut tensors: Vec<Tensor> = Vec::new();
@@ -215,7 +215,7 @@ fn planes_of(file: &SafeTensors, name: &str) -> Result<Planes, String> {
     Ok(planes)
 }
 
-/// Numbers that are encoded at a time: they stay in cache on their way to the system.
+/// Number of values that are encoded at a time, so that they are still in the cache when they are written.
 const PIECE: usize = 1 << 16;
 
 /// A tensor of the file.
@@ -232,7 +232,7 @@ enum Content<'a> {
 }
 
 impl Content<'_> {
-    /// Encoded, bytes.
+    /// Encoded length, bytes.
     fn len(&self) -> usize {
         match self {
             Content::Planes(planes) => 4 * planes.count() * planes.len(),
@@ -358,7 +358,7 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
         trainer.set_field(state.map_err(|why| wrong(format!("{FIELD}{why}")))?)?;
     }
     trainer.sockets = trainer.first_sockets()?;
-    // The run decided whether to learn exposures.
+    // The run may have decided to learn exposures.
     if trainer.recipe.exposure == Choice::Auto && tensors("exposure.").whole("steps").is_some() {
         trainer.sockets.exposure = Some(Exposure::new(trainer.dataset.views.len(), &trainer.dataset.train));
     }
@@ -367,7 +367,7 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
         let restored = occupant.restore(TensorSource::new(&file, &prefix));
         restored.map_err(|why| wrong(format!("{prefix}{why}")))?;
     }
-    // The run left out photographs.
+    // The run may have left out photographs.
     if let Some(trained) = tensors("").whole(TRAINED) {
         let known = |view: &u64| trainer.dataset.train.contains(&(*view as usize));
         if trained.is_empty() || !trained.iter().all(known) {

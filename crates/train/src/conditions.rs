@@ -1,16 +1,18 @@
-//! Parameters for what the data are, decided before the first step.
+//! Parameters that depend on the data, decided before the first step.
 //!
-//! - **Known space.** A scene that begins with splats at random positions needs pressure on opacities, since what floats before the cameras
-//!   fades only under it. Where points show the surfaces, or alpha or masks what is empty, the same pressure makes surfaces transparent.
-//! - **Cut-outs.** Masks leave out pixels: of people, of a watermark, or of everything but an object. Nothing then says that there is
-//!   nothing beside the object, and what floats there stands before it in other photographs.
-//! - **Skies.** Photographs of many days have skies that no scene can show at once; splats explain them by fog around all that is in
-//!   front.
-//! - **Many large photographs.** A step takes as long as they have pixels: what their halves and quarters show is learned from those.
-//! - **Wide lenses.** Pixels of a photograph by a fisheye that keeps its distortion show angles other than those of the views that are rendered later: splats
-//!   must look alike at each.
-//! - **Maps of depth and normals.** They are read, and weighed only where some can be used.
-//! - **Sparse photographs.** What only a few photographs see is not determined by them: steps beyond those that the scene takes to appear only fit
+//! - **Known space.** A scene that begins with splats at random positions needs pressure on opacities, since floaters in front of the
+//!   cameras fade only under it. Where points show the surfaces, or alpha or masks show what is empty, the same pressure makes surfaces
+//!   transparent.
+//! - **Cut-outs.** Masks leave out pixels: of people, of a watermark, or of everything but an object. In the last case nothing says that
+//!   the space around the object is empty, and floaters there are in front of it in other photographs.
+//! - **Skies.** Photographs taken on many days have skies that one scene cannot show; splats explain them by fog around everything in front
+//!   of the sky.
+//! - **Many large photographs.** The time of a step is proportional to their pixels: what is visible at half and quarter size is learned at
+//!   these sizes.
+//! - **Wide lenses.** In a fisheye photograph that keeps its distortion, pixels cover other angles than in the views that are rendered
+//!   later: splats must look the same at all of them.
+//! - **Depth and normal maps.** They are read, and have a weight only if some of them can be used.
+//! - **Sparse photographs.** A few photographs do not determine what they show: steps beyond those that the scene takes to appear only fit
 //!   splats to single photographs.
 
 use crate::depth_maps::DepthMaps;
@@ -23,48 +25,50 @@ use crate::trainer::{TrainError, Trainer};
 use glam::Vec3;
 use irradia_scene::{Photo, View};
 
-/// Training photographs that are looked at, evenly spaced.
+/// Maximum number of training photographs that are examined, evenly spaced.
 const SAMPLES: usize = 24;
-/// Their longer side, pixels.
+/// Longer side at which they are read, pixels.
 const SIDE: u32 = 96;
-/// Share of the photographs that must be cut-outs, or have a sky.
+/// Minimum fraction of the photographs that are cut-outs, or have a sky.
 const MOST: f64 = 0.75;
-/// Largest share of a cut-out that its mask keeps, and least share of its outermost pixels that it leaves out.
+/// Maximum fraction of a cut-out's pixels that its mask keeps, and minimum fraction of its outermost pixels that the mask leaves out.
 const KEPT: f64 = 0.5;
 const BORDER_LEFT_OUT: f64 = 0.6;
-/// The part of the pixels of an upright rectangle that its mask keeps, undistortion allowed for.
+/// Minimum fraction of its bounding box that a mask keeps if it keeps an upright rectangle, allowing for undistortion.
 const RECTANGLE: f64 = 0.95;
-/// Least share of a photograph that a sky covers.
+/// Minimum fraction of a photograph that a sky covers.
 const SKY_SHARE: f64 = 0.1;
-/// Cosine of the angle to the mean direction up of the photographs up to which what is at the upper edge of a photograph may be a sky: a face of a
-/// panorama that looks down has the floor there.
+/// Minimum cosine of the angle between a photograph's up direction and the mean of all for its upper edge to show a sky: a panorama's face
+/// that looks down has the floor there.
 const UPRIGHT: f32 = 0.5;
-/// Largest difference of a channel between adjacent pixels of a sky, of 255.
+/// Maximum difference of a channel between adjacent pixels of a sky, out of 255.
 const SKY_STEP: u8 = 8;
-/// Standard deviations between photographs, of the colours of their skies and of the same relative to their brightness, from which each
-/// photograph needs its own. Measured: a statue by 135 cameras 0.19 and 0.19; eleven captures of one camera, with walls and ceilings for skies, at
-/// most 0.11 and 0.08; fox with random exposures and white balances 0.19 and 0.10.
+/// Minimum standard deviation between photographs, both of their skies' colours and of these colours relative to their brightness, at which
+/// each photograph needs its own sky. Measured: a statue by 135 cameras 0.19 and 0.19; eleven captures of one camera, with walls and
+/// ceilings for skies, at most 0.11 and 0.08; fox with random exposures and white balances 0.19 and 0.10.
 const SKY_SPREAD: f64 = 0.14;
 
-/// Pixels of a training photograph, in the mean, above which photographs are large, and how many of them there must be: few are seen often in any case, and
-/// their quarters mislead. Held-out PSNR at 1600x758, 120 s of one thread: an object in 17 photographs 40.27 without and 36.78 dB with `large`; captures of 62 to
-/// 148 photographs gain 0.3 to 0.7 dB.
+/// Mean number of pixels of the training photographs above which they are large, and their minimum number: a few photographs are each seen
+/// often in any case, and their quarters mislead. Held-out PSNR at 1600x758, 120 s of one thread: an object in 17 photographs 40.27 without
+/// and 36.78 dB with `large`; captures of 62 to 148 photographs gain 0.3 to 0.7 dB.
 const LARGE: f64 = 0.8e6;
 const MANY: usize = 50;
 
-/// Degrees between adjacent photographs from which they are sparse. Held-out PSNR of `fast` at 240 pixels with the usual 3,000 steps and with 1,200 and
-/// `depth_weight` 0.5: fox, 12 photographs 13 degrees apart, 28.2 and 28.7; 6, 29 degrees apart, 24.1 and 24.9; cup, 12, 27 degrees apart, 26.4 and 26.6. With 750
-/// steps: fox, 24 photographs 7 degrees apart, 32.7 and 31.6; lund_door, 6 photographs 5 degrees apart, 35.3 and 34.3; fern, 6 photographs 2 degrees apart, 27.7
-/// and 26.7. With 90 steps for each photograph, 480 pixels: a book on a table, 6 photographs 9.4 degrees apart, 18.4 and 21.3; toys, 7 photographs 8.1 degrees
-/// apart, 24.0 and 24.2.
+/// Minimum angle between adjacent photographs, degrees, at which they are sparse. Held-out PSNR of `fast` at 240 pixels with the usual
+/// 3,000 steps and with 1,200 and `depth_weight` 0.5: fox, 12 photographs 13 degrees apart, 28.2 and 28.7; 6, 29 degrees apart, 24.1 and
+/// 24.9; cup, 12, 27 degrees apart, 26.4 and 26.6. With 750 steps: fox, 24 photographs 7 degrees apart, 32.7 and 31.6; lund_door, 6
+/// photographs 5 degrees apart, 35.3 and 34.3; fern, 6 photographs 2 degrees apart, 27.7 and 26.7. With 90 steps per photograph, 480
+/// pixels: a book on a table, 6 photographs 9.4 degrees apart, 18.4 and 21.3; toys, 7 photographs 8.1 degrees apart, 24.0 and 24.2.
 pub(crate) const SPARSE: f64 = 8.0;
-/// Of closer photographs, the steps of each are limited in inverse proportion to the degrees between them, beyond the usual number of steps. `fast` at 320 pixels with 1,000, 2,000, 4,000
-/// and 8,000 steps: a bust, 22 photographs 6.5 degrees apart, 25.77, 25.46, 24.35, 23.83; a locomotive, 18, 4.5 degrees, 23.86, 24.23, 24.10, 23.45; a toy, 17, 3.3 degrees,
-/// 30.27, 31.42, 31.16, 30.93; fern, 17, 2.1 degrees, 30.20, 30.65, 30.52, 30.23; but a drone's film, 17, 0.56 degrees, 26.38, 26.62, 26.74, 26.79; a corridor, 16, 0.06 degrees, 37.41, 38.44 with
-/// the last two. This is the angle from which on there is no limit worth having.
+/// For closer photographs, the limit on the steps of each is inversely proportional to the angle between them, and never below the usual
+/// number of steps. `fast` at 320 pixels with 1,000, 2,000, 4,000 and 8,000 steps: a bust, 22 photographs 6.5 degrees apart, 25.77, 25.46,
+/// 24.35, 23.83; a locomotive, 18, 4.5 degrees, 23.86, 24.23, 24.10, 23.45; a toy, 17, 3.3 degrees, 30.27, 31.42, 31.16, 30.93; fern, 17,
+/// 2.1 degrees, 30.20, 30.65, 30.52, 30.23; but a drone's film, 17, 0.56 degrees, 26.38, 26.62, 26.74, 26.79; a corridor, 16, 0.06 degrees,
+/// 37.41, 38.44 with the last two. At this angle, degrees, the limit stops growing: it is too high to matter.
 const CLOSEST: f64 = 0.01;
 
-/// Whether the mask of `photo` leaves out all but an object, which is no upright rectangle: that is a picture between bars.
+/// Whether the mask of `photo` leaves out all but an object. A mask that keeps an upright rectangle does not count: that is an image
+/// between bars.
 fn is_cut_out(photo: &Photo) -> bool {
     let Some(mask) = &photo.mask else { return false };
     let width = photo.width as usize;
@@ -114,7 +118,7 @@ fn sky_color(photo: &Photo) -> Option<[f64; 3]> {
     covers.then(|| sum.map(|sum| sum as f64 / (255 * count) as f64))
 }
 
-/// Whether skies of these colours, of `photographs` photographs, are too different for one scene.
+/// Whether the `colors` of skies found in `photographs` photographs are too different for one scene.
 fn skies_differ(colors: &[[f64; 3]], photographs: usize) -> bool {
     if colors.len() < 2 || (colors.len() as f64) < MOST * photographs as f64 {
         return false;
@@ -137,12 +141,13 @@ fn skies_differ(colors: &[[f64; 3]], photographs: usize) -> bool {
 }
 
 impl Trainer {
-    /// Adds to what is told of the data at the start of the run, one line: [`Event::Decided`](crate::event::Event::Decided).
+    /// Adds one line to what the run reports about its data at the start: [`Event::Decided`](crate::event::Event::Decided).
     pub fn tell(&mut self, decision: String) {
         self.decisions.push(decision);
     }
 
-    /// Puts the recipe's parameters for conditions into effect that the data meet. In the recipe, so that a resumed run has the same.
+    /// Puts the recipe's parameters into effect for the conditions that the data meet. They are changed in the recipe, so that a resumed
+    /// run has the same values.
     pub(crate) fn settle_conditions(&mut self) -> Result<(), TrainError> {
         let [large, skies, known_space, cut_out] = [
             std::mem::take(&mut self.recipe.large),
@@ -160,7 +165,7 @@ impl Trainer {
             for view in train.step_by(every) {
                 let k = &view.camera.intrinsics;
                 let small = k.scaled((SIDE as f32 / k.width.max(k.height) as f32).min(1.0));
-                // One that cannot be read ends the first step, from which the run can be resumed.
+                // A photograph that cannot be read makes the first step fail, from which the run can be resumed.
                 let Ok(photo) = view.photo.load_at(small.width, small.height) else {
                     continue;
                 };
@@ -192,7 +197,7 @@ impl Trainer {
         if are_cut_out {
             self.put_into_effect("masks leave out all but an object", "cut_out", cut_out);
         }
-        // Of wide lenses even large photographs have few pixels an angle.
+        // With wide lenses even large photographs have few pixels per angle.
         if self.pixels > LARGE && self.dataset.train.len() >= MANY && !self.has_wide_lenses() {
             self.put_into_effect("photographs are large", "large", large);
         }
@@ -200,12 +205,13 @@ impl Trainer {
         self.tell_shutters();
         self.settle_spacing();
         self.settle_maps();
-        // It carries the values of parameters from stage to stage.
+        // The clock carries the values of parameters from stage to stage, and must start with the new ones.
         self.clock = Clock::new(&self.recipe);
         Ok(())
     }
 
-    /// Reads the maps of depth and of normals if the recipe weighs them; without any that count, frames need no depth for them.
+    /// Reads the depth and normal maps if the recipe gives them a weight. If none can be used, the weight is removed: frames then need no
+    /// depth for them.
     fn settle_maps(&mut self) {
         if DepthMaps::are_given(&self.dataset) && self.recipe.uses(Param::DepthMapWeight) {
             let maps = DepthMaps::read(&self.dataset);
@@ -233,14 +239,14 @@ impl Trainer {
         }
     }
 
-    /// Says how fast cameras move, so that velocities of another unit are seen.
+    /// Reports how fast cameras move, so that velocities in a wrong unit are noticed.
     fn tell_shutters(&mut self) {
         let (train, views) = (&self.dataset.train, &self.dataset.views);
         let shutters = train.iter().filter_map(|view| views[*view].camera.shutter);
         let turns: Vec<f64> = shutters.map(|shutter| f64::from(shutter.rotation.length())).collect();
         if !turns.is_empty() {
             self.decisions.push(format!(
-                "{} of {} cameras move while their rows are exposed (rolling shutter), and turn by {:.2} degrees in the median",
+                "{} of {} cameras move while their rows are exposed (rolling shutter), and turn by a median of {:.2} degrees",
                 turns.len(),
                 train.len(),
                 median(turns).to_degrees()
@@ -248,13 +254,14 @@ impl Trainer {
         }
     }
 
-    /// Whether some training photographs are by wide lenses, and not cut into faces.
+    /// Whether some training photographs were taken with wide lenses and are not cut into faces.
     fn has_wide_lenses(&self) -> bool {
         let mut train = self.dataset.train.iter();
         train.any(|view| self.dataset.views[*view].camera.intrinsics.lens.is_wide())
     }
 
-    /// Steps for each training photograph that a run without a number of steps has at most, 0 for any: the recipe's `sparse_visits`, and more of closer photographs.
+    /// Maximum number of steps per training photograph in a run without a given number of steps, 0 for no limit: the recipe's
+    /// `sparse_visits`, and more for closer photographs.
     pub(crate) fn most_visits(&self) -> u64 {
         let (visits, spacing) = (self.recipe.sparse_visits, self.spacing.to_degrees());
         if visits == 0 || spacing >= SPARSE {
@@ -276,7 +283,7 @@ impl Trainer {
         if self.options.steps.is_none() && least > self.pace {
             self.pace = least;
             self.decisions.push(format!(
-                "adjacent photographs are {spacing:.0} degrees apart: at most {} steps in place of {total}, since more fit single photographs (--steps for another number)",
+                "adjacent photographs are {spacing:.0} degrees apart: at most {} steps instead of {total}, since more would only fit single photographs (--steps sets another number)",
                 self.total_steps()
             ));
         }
@@ -385,7 +392,7 @@ pub(crate) mod tests {
         assert!(!scales(49, [1200, 900], Lens::Pinhole, &[]).0);
         assert!(
             !scales(50, [1600, 1600], Lens::fisheye([0.0; 4]), &[]).0,
-            "few pixels an angle"
+            "few pixels per angle"
         );
         let set = ["params.image_scale=0.75".to_owned()];
         assert_eq!(scales(50, [1200, 900], Lens::Pinhole, &set), (false, Knob::Const(0.75)));
@@ -454,10 +461,11 @@ pub(crate) mod tests {
                 .iter()
                 .any(|line| line.contains("30 degrees") && line.contains("1080 steps"))
         );
-        // A fifth of the recipe's length at least.
+        // At least a fifth of the recipe's length.
         assert_eq!(trainer(4, None).total_steps(), 600);
         assert_eq!(trainer(12, Some(2000)).total_steps(), 2000);
-        // Closer ones have the recipe's length at least, and with a budget as many steps as they determine: 60 are 6 degrees apart.
+        // Closer photographs have at least the recipe's length, and with a budget as many steps as their limit allows: 60 are 6 degrees
+        // apart.
         let close = trainer(60, None);
         assert_eq!(close.total_steps(), 3000);
         assert!((3000.0 / close.least_pace() / (60.0 * 90.0 * 8.0 / 6.0) - 1.0).abs() < 0.02);
@@ -499,7 +507,7 @@ pub(crate) mod tests {
     #[test]
     fn masks_of_objects_are_told_from_those_of_people_and_borders() {
         let masked = |kept: &dyn Fn(u32, u32) -> bool| is_cut_out(&photo([60, 90], |_, _| [99; 3], Some(kept)));
-        // A statue that stands on the lower edge.
+        // A statue that reaches the lower edge.
         assert!(masked(&|x, y| x.abs_diff(30) < y / 6 && y > 10));
         assert!(
             !masked(&|x, y| !((20..40).contains(&x) && y > 40)),
@@ -530,7 +538,7 @@ pub(crate) mod tests {
         assert!((r - 120.0 / 255.0).abs() < 0.01 && (g - 150.0 / 255.0).abs() < 1e-6 && (b - 0.797).abs() < 0.01);
         assert_eq!(sky_color(&horizon(5)), None);
         let hidden = photo([60, 80], sky, Some(&|_, y| y > 60));
-        assert_eq!(sky_color(&hidden), None, "masked skies are none");
+        assert_eq!(sky_color(&hidden), None, "a masked sky does not count");
     }
 
     #[test]

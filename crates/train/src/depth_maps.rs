@@ -1,11 +1,11 @@
-//! Known depths, as the reference of a loss: of the points that a view is known to see, and of maps that were given beside photographs, by a
+//! Known depths, as the reference of a loss: of the points that a view is known to see, and of depth maps given with photographs, from a
 //! sensor or a network.
 //!
-//! What a network estimates is depth or inverse depth, up to a scale and a shift that differ from photograph to photograph. The points that a
-//! view is known to see tell all three: per view, a line is fitted robustly through the values at its points, once for their depths and
-//! once for their inverses, and what fits most views better is what the maps are (Kerbl et al., "Hierarchical 3D Gaussians", 2024, fit the
-//! inverse depths of one network in this way). Their depths then are world units. Without points, maps are taken for depths, and the loss
-//! itself fits scale and shift to each frame.
+//! What a network estimates is depth or inverse depth, up to a scale and a shift that differ from photograph to photograph. The points that
+//! a view is known to see determine all three: per view, a line is fitted robustly through the values at its points, once to their depths
+//! and once to their inverses, and the maps are taken for what fits the views better (Kerbl et al., "Hierarchical 3D Gaussians", 2024, fit
+//! the inverse depths of one network in this way). Fitted depths are in world units. Without points, maps are taken for depths, and the
+//! loss itself fits scale and shift to each frame.
 
 use crate::recipe::Param;
 use crate::robust::median;
@@ -15,15 +15,15 @@ use irradia_measure::{DepthKind, DepthSample};
 use irradia_scene::{Camera, Dataset, DepthGrid, View};
 use rayon::prelude::*;
 
-/// Points of a view below which its map is not fitted to them.
+/// Minimum number of points of a view to which its map is fitted.
 const ENOUGH_POINTS: usize = 16;
-/// Median relative error of the fitted depths at a view's points, above which its map shows something else.
+/// Median relative error of the fitted depths at a view's points from which its map is not used: it shows something else.
 const WORST_FIT: f64 = 0.2;
 /// Rounds of reweighted least squares.
 const ROUNDS: usize = 10;
-/// Relative residual below which pairs weigh the same.
+/// Relative residual below which pairs have the same weight.
 const LEAST_RESIDUAL: f64 = 1e-3;
-/// Depths farther outside the range of a view's points than this factor are extrapolated, and do not count.
+/// Depths outside the range of a view's points by more than this factor are extrapolated, and are not used.
 const BEYOND: f32 = 3.0;
 
 /// The maps of a dataset's training views.
@@ -35,13 +35,13 @@ pub(crate) struct DepthMaps {
     pub summary: String,
 }
 
-/// The map of a view, as it counts.
+/// The map of a view, as the loss uses it.
 struct Known {
     grid: DepthGrid,
     kind: DepthKind,
 }
 
-/// What a map's values are.
+/// The meaning of a map's values.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Values {
     Depths,
@@ -65,7 +65,7 @@ struct Line {
 struct Read {
     grid: DepthGrid,
     pairs: Vec<[f64; 2]>,
-    /// Through the pairs, in the order of [`Values::BOTH`]; `None` for too few of them.
+    /// Lines through the pairs, in the order of [`Values::BOTH`]; `None` if there are too few pairs.
     lines: Option<[Line; 2]>,
 }
 
@@ -112,7 +112,7 @@ impl DepthMaps {
                     let line = lines[values as usize];
                     line.is_sound().then(|| map.in_world(&line, values))
                 }
-                // Only depths need no points.
+                // Without points, only depths can be used.
                 None => (values == Values::Depths).then_some(Known {
                     grid: map.grid,
                     kind: DepthKind::Relative,
@@ -137,12 +137,12 @@ impl DepthMaps {
         }
     }
 
-    /// Whether any map counts.
+    /// Whether no map can be used.
     pub fn is_empty(&self) -> bool {
         self.of.iter().all(Option::is_none)
     }
 
-    /// The depths of `view` at the pixels of `camera`, and what they mean.
+    /// The depths of `view` at the pixels of `camera`, and their kind.
     pub fn samples(&self, view: usize, camera: &Camera) -> Option<(Vec<DepthSample>, DepthKind)> {
         let Known { grid, kind } = self.of.get(view)?.as_ref()?;
         let k = &camera.intrinsics;
@@ -158,7 +158,7 @@ impl DepthMaps {
 }
 
 impl Read {
-    /// With depths in world units.
+    /// The map with depths in world units; 0 where they are unknown or extrapolated.
     fn in_world(mut self, line: &Line, values: Values) -> Known {
         let depths = self.pairs.iter().map(|[_, depth]| *depth as f32);
         let (nearest, farthest) = depths.fold((f32::INFINITY, 0f32), |(near, far), z| (near.min(z), far.max(z)));
@@ -179,7 +179,8 @@ impl Read {
 }
 
 impl Line {
-    /// The line through `[value, depth]` with the least absolute errors, relative to the depth. Its error is infinite if it does not rise.
+    /// The line through `[value, depth]` with the least absolute errors, relative to the depth. Its error is infinite if its scale is not
+    /// positive.
     fn fit(pairs: &[[f64; 2]], values: Values) -> Self {
         let target = |z: f64| match values {
             Values::Depths => z,
@@ -212,8 +213,8 @@ impl Line {
         line
     }
 
-    /// A line that up to a quarter of wrong pairs do not move: the median of the slopes between values of the lower half and those of the
-    /// upper half (Theil 1950, Sen 1968), and the median shift.
+    /// A line that is robust to wrong pairs, up to a quarter of all: the median of the slopes between values of the lower half and those of
+    /// the upper half (Theil 1950, Sen 1968), and the median shift.
     fn through_halves(mut pairs: Vec<[f64; 2]>) -> Self {
         pairs.sort_by(|a, b| a[0].total_cmp(&b[0]));
         let (lower, upper) = pairs.split_at(pairs.len() / 2);
@@ -267,7 +268,7 @@ impl Trainer {
             .collect()
     }
 
-    /// Depths of the map that was given beside the photograph of view `view`, if the plan uses them.
+    /// Depths of the map given with the photograph of view `view`, if the plan uses them.
     pub(crate) fn given_depths(
         &mut self,
         view: usize,
@@ -283,7 +284,7 @@ impl Trainer {
     }
 }
 
-/// Whether a value of a map is one.
+/// Whether a value of a map is known.
 fn is_known(value: f32) -> bool {
     value > 0.0 && value.is_finite()
 }
@@ -324,7 +325,7 @@ mod tests {
         }
     }
 
-    /// Depth of a slanted floor that the camera at the origin sees at these fractions of its picture.
+    /// Depth of a slanted floor that the camera at the origin sees at these fractions of its image.
     fn floor(x: f32, y: f32) -> f32 {
         2.0 + 3.0 * x + 5.0 * y * y
     }
@@ -409,7 +410,8 @@ mod tests {
                 "{}",
                 maps.summary
             );
-            // A cell is a thirty-second of the picture wide, over which depths change by up to a fifth at points between its centres.
+            // Points are between the centres of cells, which are 1/32 of the image apart; over this distance depths change by up to a
+            // fifth.
             assert!(
                 worst(&maps, 0) < 0.05 && worst(&maps, 1) < 0.05,
                 "{} {}",
@@ -451,7 +453,7 @@ mod tests {
         let (samples, kind) = maps.samples(0, &camera()).unwrap();
         assert_eq!((samples.len(), kind), (1024, DepthKind::Relative));
         assert!(maps.samples(1, &camera()).unwrap().0.is_empty(), "nothing is known");
-        // Where the others are inverse depths, a map without points is not known to be one.
+        // If the other maps are inverse depths, a map without points is not used.
         let maps = DepthMaps::read(&dataset(vec![map(|z| 1.0 / z), map(|z| 1.0 / z)], &[1]));
         assert!(maps.samples(0, &camera()).is_some() && maps.samples(1, &camera()).is_none());
     }

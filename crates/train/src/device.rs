@@ -1,4 +1,4 @@
-//! What a run puts on its device, and the losses of a step where its frame is: on a GPU, if all of them have a form there.
+//! Places a run on its device, and computes the losses of a step where its frame is: on a GPU, if the GPU supports all of them.
 
 use crate::field_step::is_field;
 use crate::objective::{ObjectiveValues, Reference};
@@ -17,8 +17,8 @@ use {
     irradia_splat::{DeviceGradient, Statistics},
 };
 
-/// Puts the engine of the splats on the device, as far as the recipe's can be trained there for `cameras`, which begin as `first_splats`. Returns
-/// what is told of the device, with the recipe's field, which follows.
+/// Puts the engine of the splats on the device if the recipe's splats, `first_splats` at first, can be trained there in views of `cameras`.
+/// Returns lines to report about the devices of the splats and of the recipe's field, which is placed later.
 pub(crate) fn use_device(
     engine: &mut Engine,
     device: &Device,
@@ -53,7 +53,7 @@ pub(crate) fn use_device(
         told.push(if has_form(recipe) {
             format!("the field is trained on {device}")
         } else {
-            format!("the field is trained on the CPU, not on {device}, which takes hash grids marched by occupancy")
+            format!("the field is trained on the CPU, not on {device}, which only supports hash grids with occupancy")
         });
     }
     Ok(told)
@@ -73,10 +73,10 @@ fn has_form(_: &Recipe) -> bool {
 }
 
 impl Trainer {
-    /// Brings the state from its device, before it is written.
+    /// Reads the state back from its device, before it is written.
     ///
     /// # Errors
-    /// When the device has failed: what it returned is not to be saved.
+    /// If the device has failed: what it returned must not be saved.
     pub fn read_back(&self) -> Result<(), TrainError> {
         self.engine.state();
         if let Some(field) = &self.field {
@@ -85,7 +85,7 @@ impl Trainer {
         self.check_device()
     }
 
-    /// What has gone wrong on the device.
+    /// The error of the device, if it has failed.
     pub(crate) fn check_device(&self) -> Result<(), TrainError> {
         if let Some(field) = &self.field {
             field.check_device()?;

@@ -3,10 +3,10 @@
 use crate::photos::Prepared;
 use rayon::prelude::*;
 
-/// Luma of ITU-R 601-2, with which the authors' code converts a photograph to grey.
+/// Luma of ITU-R 601-2, by which the authors' code converts a photograph to grey.
 const LUMA: [f32; 3] = [0.299, 0.587, 0.114];
 
-/// Eight times each pixel's luma minus that of its neighbours, clamped to \[0, 1\], `[H, W]`; 0 on the image's border.
+/// Eight times each pixel's luma minus the sum of its eight neighbours' luma, clamped to \[0, 1\], `[H, W]`; 0 on the image's border.
 pub(crate) fn edges(photo: &Prepared, edges: &mut Vec<f32>) {
     let (width, height) = (photo.width as usize, photo.height as usize);
     let luma = |x: usize, y: usize| {

@@ -18,9 +18,9 @@ use std::ops::ControlFlow;
 /// 81 dB.
 pub const MAX_PSNR: f64 = 100.0;
 
-/// Bytes of the views that are evaluated at the same time.
+/// Maximum bytes of the views that are evaluated at the same time.
 const AT_ONCE: usize = 256 << 20;
-/// Bytes of a pixel of such a view: photograph, and both images as floats.
+/// Bytes per pixel of such a view: the photograph, and both images as floats.
 const PIXEL: usize = 3 + 2 * 12;
 
 /// The result of one view with its images, `[H, W, 3]`.
@@ -62,13 +62,14 @@ pub struct EvalOptions<'a> {
     pub metrics: Metrics<'a>,
     /// The parameters to fit on the left half of each view for its `half_fit_psnr`.
     pub half_fit: HalfFit,
-    /// What the lenses do to every frame.
+    /// The vignettes of the lenses, which are applied to every frame.
     pub vignette: Option<&'a Vignette>,
     /// Where views are rendered, except those that fit parameters.
     pub device: &'a Device,
 }
 
-/// Renders `model` from the views `indices` of `dataset` and compares; passes each result to `see`, which may end the evaluation.
+/// Renders `model` from the views `indices` of `dataset` and compares the frames with their photographs; passes each result to `see`, which
+/// may end the evaluation.
 ///
 /// # Errors
 /// When a photograph cannot be read, or the device fails.
@@ -85,7 +86,7 @@ pub fn evaluate_views(
     let views = indices.iter().map(|index| &dataset.views[*index]);
     let background = options.render.background;
     for batch in indices.chunks(at_once(views)) {
-        // Photographs are decoded by a thread each; a frame is rendered by all threads, or the device.
+        // Photographs are decoded by one thread each; a frame is rendered by all threads, or the device.
         let load = |index: &usize| {
             let view = &dataset.views[*index];
             let photo = view.photo.load()?;
@@ -151,7 +152,7 @@ fn measure(render: &Image, truth: &Image, mask: Option<&[u8]>, metrics: Metrics)
     }
 }
 
-/// Views that are evaluated at the same time: one a thread, if they are small.
+/// Number of views that are evaluated at the same time: one per thread, if they are small.
 fn at_once<'a>(views: impl Iterator<Item = &'a View>) -> usize {
     let pixels = views.map(|view| view.camera.intrinsics.width as usize * view.camera.intrinsics.height as usize);
     let largest = pixels.max().unwrap_or(0).max(1);

@@ -47,7 +47,7 @@ pub enum Event {
         /// Current number of splats.
         splats: usize,
     },
-    /// The held-out views were evaluated, or 32 of them where there are more.
+    /// The held-out views were evaluated, or 32 of them if there are more.
     Evaluated {
         /// Steps made so far.
         step: u64,
@@ -78,7 +78,7 @@ pub enum Event {
         /// Steps made so far.
         step: u64,
     },
-    /// What was decided from the data before the first step.
+    /// What was decided from the data, before the first step or later.
     Decided {
         /// One line.
         message: String,
@@ -151,7 +151,7 @@ pub enum Signal {
     Continue,
     /// Write a checkpoint now.
     Save,
-    /// Pause until [`Observer::while_paused`] returns this for no observer.
+    /// Pause until no observer returns this from [`Observer::while_paused`].
     Pause,
     /// Stop, with everything saved.
     Stop,
@@ -159,7 +159,7 @@ pub enum Signal {
 
 /// An observer of a run, which can end it only with [`Signal::Stop`].
 pub trait Observer {
-    /// Receives `event`; `trainer` is its state after the event.
+    /// Receives `event`; `trainer` is in its state after the event.
     fn on_event(&mut self, event: &Event, trainer: &crate::Trainer) -> Signal;
 
     /// Whether to stop; polled between views while held-out views are evaluated, when there are no events.

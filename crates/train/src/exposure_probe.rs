@@ -2,8 +2,8 @@
 //!
 //! After the first tenth of a run splats show every view's mean colour, in an exposure common to all photographs. Each
 //! photograph's brightness relative to its frame is then its relative exposure. Automatic exposure that follows the view changes
-//! smoothly from camera to camera: splats reproduce it, by spherical harmonics, in held-out views as well. What remains after a
-//! prediction by the nearest cameras fits no scene; splats explain it by veils before the cameras.
+//! smoothly from camera to camera: splats reproduce it, by spherical harmonics, in held-out views as well. What remains after a prediction
+//! by the nearest cameras fits no scene; splats explain it by veils in front of the cameras.
 
 use crate::event::Event;
 use crate::photos::Prepared;
@@ -15,17 +15,17 @@ use irradia_scene::Camera;
 
 /// Fraction of a run after which the decision is made.
 pub(crate) const AT: f64 = 0.1;
-/// Maximum number of training views to measure: enough for a standard deviation within a tenth.
+/// Maximum number of training views to measure: enough for a standard deviation accurate to a tenth.
 const VIEWS: usize = 64;
-/// Views below which nothing is decided.
+/// Minimum number of views for a decision.
 const MIN_VIEWS: usize = 8;
-/// Cameras that predict a view's exposure.
+/// Number of cameras that predict a view's exposure.
 const NEIGHBOURS: usize = 3;
-/// Standard deviation of ln exposure, beyond its prediction, from which exposures are learned.
+/// Minimum standard deviation of ln exposure, beyond its prediction, at which exposures are learned.
 const THRESHOLD: f64 = 0.1;
-/// Colours outside are clipped in the photograph, or too dark for a ratio.
+/// Usable colours: those outside are clipped in the photograph, or too dark for a ratio.
 const USABLE: std::ops::RangeInclusive<f32> = 8.0 / 255.0..=250.0 / 255.0;
-/// Pixels below which a view is skipped.
+/// Minimum number of usable pixels of a view; a view with fewer is skipped.
 const MIN_PIXELS: usize = 100;
 
 /// Mean ln exposure of `photo` relative to `color` `[3, H, W]`, its frame; `None` if too few pixels of both can be compared.
@@ -49,7 +49,7 @@ fn log_exposure(color: &[f32], photo: &Prepared) -> Option<f64> {
 }
 
 /// Standard deviation of the ln exposures of `views` beyond what the nearest cameras predict; `None` for too few views. `unit` is
-/// the extent of the scene, which makes a turn by one radian as far as a move by one extent.
+/// the extent of the scene, which makes a turn by one radian count as much as a move by one extent.
 fn unpredicted(views: &[(Camera, f64)], unit: f32) -> Option<f64> {
     if views.len() < MIN_VIEWS {
         return None;
@@ -63,13 +63,14 @@ fn unpredicted(views: &[(Camera, f64)], unit: f32) -> Option<f64> {
         let predicted = near[..NEIGHBOURS].iter().map(|(_, log)| log).sum::<f64>() / NEIGHBOURS as f64;
         own - predicted
     };
-    // A few odd photographs are no reason; a mean of k independent values adds 1/k to the variance.
+    // The spread is robust, since a few odd photographs are no reason for exposures; the mean of k independent values adds 1/k to the
+    // variance.
     let spread = spread(views.iter().enumerate().map(residual));
     Some(spread / (1.0 + 1.0 / NEIGHBOURS as f64).sqrt())
 }
 
 impl Trainer {
-    /// Adds an exposure per photograph if the photographs need it, and says so.
+    /// Adds an exposure per photograph if the photographs need it, and reports it.
     pub(crate) fn decide_exposure(&mut self) -> Result<Option<Event>, TrainError> {
         let plan = plan(&self.recipe, &self.clock);
         let mut measured = Vec::new();

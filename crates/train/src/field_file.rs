@@ -36,7 +36,7 @@ pub fn to_bytes(field: &Field) -> Vec<u8> {
 /// The inverse of [`to_bytes`].
 ///
 /// # Errors
-/// When the bytes are not such a file, or a truncated one.
+/// If the bytes are not such a file, or are truncated.
 pub fn from_bytes(bytes: &[u8]) -> Result<Field, TrainError> {
     let wrong = |why: String| TrainError::Checkpoint(format!("not a field of this program: {why}"));
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| wrong(e.to_string()))?;
@@ -45,7 +45,7 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Field, TrainError> {
     let text = text.ok_or_else(|| wrong("its header does not describe one".into()))?;
     let header: Header = serde_json::from_str(text).map_err(|e| wrong(e.to_string()))?;
     if header.format != FORMAT {
-        return Err(wrong(format!("format {} and not {FORMAT}", header.format)));
+        return Err(wrong(format!("format {}, expected {FORMAT}", header.format)));
     }
     header.config.check()?;
     // Before allocating what the header merely claims.

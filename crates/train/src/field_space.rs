@@ -1,4 +1,4 @@
-//! The space of a field, as determined by what the cameras do.
+//! The space of a field, as determined by the arrangement of the cameras.
 
 use crate::recipe::FieldSpace;
 use crate::trainer::TrainError;
@@ -14,8 +14,8 @@ const NEARER: f32 = 0.001;
 /// The space of a field trained on `dataset`, and why, in one line. `transparent`: photographs have alpha.
 ///
 /// [`FieldSpace::Auto`] is normalised device coordinates if the cameras face forward ([`Facing::is_forward`]) towards a scene whose
-/// nearest depth is known: they spend their cells in proportion to what such cameras see, and have none for what is beside or
-/// behind them. Whether the depth is known from bounds (LLFF) or from points (COLMAP) does not matter.
+/// nearest depth is known: these coordinates spend cells in proportion to what such cameras see, and none on what is beside or behind them.
+/// Whether the depth is known from bounds (LLFF) or from points (COLMAP) does not matter.
 ///
 /// # Errors
 /// [`TrainError::NoSpace`].
@@ -40,12 +40,12 @@ pub fn field_space(kind: FieldSpace, dataset: &Dataset, transparent: bool) -> Re
 
 fn automatic(cameras: &[Camera], near: impl FnOnce() -> Option<f32>, transparent: bool) -> (Option<Space>, String) {
     let not_forward = match Facing::of(cameras) {
-        None => "the cameras face all ways".to_owned(),
+        None => "the cameras face in all directions".to_owned(),
         Some(facing) if facing.cone > FORWARD_CONE => {
             format!("the cameras turn by up to {:.0} degrees from their mean", facing.cone)
         }
         Some(facing) => match near() {
-            None => "neither depth bounds nor points tell where the scene begins".to_owned(),
+            None => "neither depth bounds nor points say where the scene begins".to_owned(),
             Some(near) => {
                 let space = facing.is_forward(near).then(|| Space::ndc(cameras, near)).flatten();
                 if space.is_some() {
@@ -61,10 +61,10 @@ fn automatic(cameras: &[Camera], near: impl FnOnce() -> Option<f32>, transparent
         },
     };
     if transparent {
-        let why = format!("a cube about what the cameras look at: photographs have alpha, and {not_forward}");
+        let why = format!("a cube around what the cameras look at: photographs have alpha, and {not_forward}");
         (Space::around(cameras, false), why)
     } else {
-        let why = format!("a contracted world about what the cameras look at: {not_forward}");
+        let why = format!("a contracted world around what the cameras look at: {not_forward}");
         (Space::around(cameras, true), why)
     }
 }
@@ -157,7 +157,7 @@ mod tests {
             let (space, why) = auto(&dataset(across, angles, near), transparent);
             assert!(space.outside == outside && why.contains(says), "{why}");
         }
-        // One camera stands behind what is nearest to another.
+        // One camera is beyond the nearest depth of the others.
         let mut advanced = dataset(across, inwards, Some(0.5));
         advanced.views[1].camera.pose.position.z = 3.0;
         let (space, why) = auto(&advanced, false);

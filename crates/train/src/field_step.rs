@@ -1,4 +1,4 @@
-//! A stage of radiance field: its steps, and the initialisation of splats after it.
+//! A stage that trains a radiance field: its steps, and the initialisation of splats after it.
 
 use crate::field_space::field_space;
 use crate::photos::Prepared;
@@ -18,7 +18,9 @@ const STREAM_FIELD: u64 = 6;
 const STREAM_POINTS: u64 = 7;
 /// Memory of all photographs, bytes, above which a step uses only some of them: 5,500 of 360 x 360.
 pub const ALL_PHOTOS: usize = 2 << 30;
-/// Photographs per step if they exceed it.
+/// Bytes of a pixel of a training photograph: four channels, or three and a mask.
+pub const PHOTO_PIXEL: usize = 4;
+/// Number of photographs per step if all together exceed it.
 const SHARED: usize = 16;
 /// Whether stage `stage` trains a field.
 pub fn is_field(recipe: &Recipe, stage: usize) -> bool {
@@ -26,7 +28,7 @@ pub fn is_field(recipe: &Recipe, stage: usize) -> bool {
     stage.represents == Represents::Field
 }
 
-/// The field of `knobs` in the space determined by the dataset, and why that space.
+/// The field of `knobs` in the space determined by the dataset, and the reason for that space.
 pub fn first_field(
     knobs: &FieldKnobs,
     dataset: &Dataset,
@@ -141,7 +143,7 @@ impl Trainer {
             .iter()
             .map(|view| {
                 let k = &self.dataset.views[*view].camera.intrinsics;
-                5 * k.width as usize * k.height as usize
+                PHOTO_PIXEL * k.width as usize * k.height as usize
             })
             .sum();
         if bytes <= ALL_PHOTOS {

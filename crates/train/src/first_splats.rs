@@ -13,7 +13,7 @@ const FEWEST_POINTS: usize = 10;
 
 /// Maximum number of training views from which random first splats get their colours, evenly spaced.
 const FIRST_VIEWS: usize = 256;
-/// Scale at which photographs that take less time then are read for these colours.
+/// Scale at which photographs are read for these colours, if that takes less time than at full size.
 const FIRST_SCALE: f32 = 0.25;
 
 impl Trainer {

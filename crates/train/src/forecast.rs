@@ -50,8 +50,8 @@ const SPLATS_BY_PIXELS: f64 = 0.6;
 const SPLATS_FOLLOW: f64 = 0.12;
 
 /// How far off a prediction may be, as a factor either way: up to a tenth of the recipe, and from nine tenths on; in between it falls
-/// evenly in the logarithm. Over 21 runs of two recipes on six scenes, on a busy machine, the time that was left lay within this range
-/// in 92 % of the steps after the first tenth, and in 74 % in the worst run.
+/// evenly in the logarithm. Over 21 runs of two recipes on six scenes, on a busy machine, the remaining time was within this range in 92 %
+/// of the steps after the first tenth, and in 74 % in the worst run.
 const UNCERTAINTY: [f64; 2] = [2.5, 1.3];
 
 /// Range of the remaining time in nine of ten runs, if `left` seconds were predicted.

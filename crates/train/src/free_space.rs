@@ -1,25 +1,26 @@
 //! The empty space around cameras. A camera stands in free space, and nothing that its view is known to see is closer than its
-//! nearest points; splats closer than a fraction of that explain one photograph each, and veil the views between. Only what is around a nearer point
-//! that many views see, such as the tip of a leaf, stays.
+//! nearest points; splats closer than a fraction of that depth explain one photograph each, and veil the views in between. Only splats
+//! around a nearer point that many views see, such as the tip of a leaf, are kept.
 
 use glam::Vec3;
 use irradia_scene::{Dataset, PointCloud, View};
 use irradia_splat::SplatState;
 use rayon::prelude::*;
 
-/// Points a view must see for its nearest ones to be known.
+/// Minimum number of points that a view sees for its nearest depth to be known.
 const ENOUGH_POINTS: usize = 20;
-/// The fraction of a view's points that may be closer than its nearest depth: wrong matches lie before the surface too.
+/// The fraction of a view's points that may be closer than its nearest depth: wrong matches are in front of the surface too.
 const OUTLIERS: f64 = 0.02;
 /// The fraction of all points that may lie in a sphere.
 const STRAY: f64 = 0.001;
-/// Views that see a point which is certainly there. Held-out PSNR without support and with that of points seen by 3 and 6: a plant in a room, at which some
-/// photographs are taken from among its leaves, 23.25, 23.54, 23.38 dB; mouse, whose table has wrong points, 24.23, 23.82, 24.23; lund_door and maryRose the same.
+/// Minimum number of views that see a point for it to be certain. Held-out PSNR without support and with that of points seen by 3 and 6: a
+/// plant in a room, with some photographs taken from among its leaves, 23.25, 23.54, 23.38 dB; mouse, whose table has wrong points, 24.23,
+/// 23.82, 24.23; lund_door and maryRose the same.
 const WITNESSES: u32 = 6;
 /// Distance from such a point, relative to its distance from the camera, up to which splats may belong to the same surface.
 const SUPPORT: f32 = 0.15;
 
-/// A sphere around each training camera of which the nearest depth is known.
+/// A sphere around each training camera whose nearest depth is known.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct FreeSpace {
     spheres: Vec<Sphere>,
@@ -29,7 +30,8 @@ pub(crate) struct FreeSpace {
 struct Sphere {
     center: Vec3,
     radius: f32,
-    /// Points within or near it that many views see, such as the tips of leaves, and the distance up to which they support splats; world units.
+    /// Points within or near it that many views see, such as the tips of leaves, and the distance up to which each supports splats; world
+    /// units.
     points: Vec<(Vec3, f32)>,
 }
 
@@ -107,7 +109,7 @@ fn certain_points(dataset: &Dataset) -> Vec<Vec3> {
     positions.iter().zip(witnesses).filter_map(certain).collect()
 }
 
-/// Distance from a view's camera to the nearest of all points but a few outliers: a wall behind the camera stays.
+/// Distance from a view's camera to the nearest of all points except a few outliers, so that a wall behind the camera is kept.
 fn distance_to_points(points: &PointCloud, view: &View) -> f32 {
     let eye = view.camera.pose.position;
     let mut distances: Vec<f32> = points.positions.iter().map(|p| p.distance(eye)).collect();
@@ -127,7 +129,7 @@ fn nearest_depth(dataset: &Dataset, view: &View) -> Option<f32> {
     Some(*depths.select_nth_unstable_by(at, f32::total_cmp).1)
 }
 
-/// Depths along +Z of the points that a view sees, world units; `None` if they are too few to know its surfaces.
+/// Depths along +Z of the points that a view sees, world units; `None` if there are too few to determine its surfaces.
 pub(crate) fn seen_depths(dataset: &Dataset, view: &View) -> Option<Vec<f32>> {
     let positions = &dataset.points.as_ref()?.positions;
     let seen = view.points_seen.iter().filter_map(|i| positions.get(*i as usize));

@@ -43,7 +43,7 @@ pub struct HeldOut<'a> {
     pub mask: Option<&'a [u8]>,
     /// How the scene is rendered.
     pub options: &'a RenderOptions,
-    /// What the lenses do to every frame.
+    /// The vignettes of the lenses, which are applied to every frame.
     pub vignette: Option<&'a Vignette>,
     /// Extent of the scene, world units.
     pub extent: f32,
@@ -108,7 +108,7 @@ fn fitted_pose(model: &Model, renderer: &mut Renderer, view: &HeldOut, fit: Half
         data: truth.to_u8(),
         mask: mask.map(<[u8]>::to_vec),
     };
-    // Half size first: what is far off is found there.
+    // Half size first: large errors of the pose are corrected there.
     let targets = [0.5, 1.0].map(|scale| {
         let intrinsics = size.scaled(scale);
         let target = photo.resized(intrinsics.width, intrinsics.height);

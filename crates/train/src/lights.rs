@@ -1,4 +1,4 @@
-//! The light of each photograph, as a run has learned it: to look at its scene as one of its photographs shows it.
+//! The light of each photograph as a run has learned it, to render the scene in the light of one of its photographs.
 
 use crate::TrainError;
 use crate::field_file;
@@ -9,8 +9,8 @@ use irradia_splat::Surface;
 use std::borrow::Cow;
 use std::fmt::Display;
 
-/// What photographs make of a scene in the mean light: their exposures, and what their appearance codes add to its colours. A sky and a bilateral
-/// grid belong to a photograph's own frame and are not among them.
+/// How photographs differ from the scene in its mean light: their exposures, and the colours that their appearance codes add. A sky and a
+/// bilateral grid belong to a photograph's own frame and are not included.
 #[derive(Clone, Debug)]
 pub struct Lights {
     exposures: Option<Exposure>,
@@ -25,7 +25,7 @@ pub struct Light<'a> {
 }
 
 impl Lights {
-    /// Those of a training; `None` if it has learned none.
+    /// The lights of a training; `None` if it has not learned any.
     pub fn of_training(sockets: &Sockets) -> Option<Self> {
         let appearance = sockets.appearance.as_ref().and_then(Appearance::learnt).cloned();
         let lights = Self {
@@ -38,7 +38,7 @@ impl Lights {
     /// From the files that a run writes beside its scene, exposures and appearance codes; `None` if there are none.
     ///
     /// # Errors
-    /// When one is damaged, or they are of different numbers of photographs.
+    /// If a file is damaged, or the two are for different numbers of photographs.
     pub fn from_files(exposures: Option<&[u8]>, appearance: Option<&[u8]>) -> Result<Option<Self>, TrainError> {
         let damaged = |what: &str, why: &dyn Display| TrainError::Checkpoint(format!("{what}: {why}"));
         let exposures = exposures.map(Exposure::from_file).transpose();
@@ -48,13 +48,13 @@ impl Lights {
         if let Some(field) = &appearance
             && (!matches!(field.config.sampler, Sampler::Given { .. }) || field.config.images == 0)
         {
-            return Err(TrainError::Checkpoint("the field has no codes of photographs".into()));
+            return Err(TrainError::Checkpoint("the field has no appearance codes".into()));
         }
         if let (Some(exposures), Some(field)) = (&exposures, &appearance)
             && exposures.views() != field.config.images
         {
             return Err(TrainError::Checkpoint(format!(
-                "exposures of {} photographs, appearance codes of {}",
+                "exposures for {} photographs, but appearance codes for {}",
                 exposures.views(),
                 field.config.images
             )));
@@ -63,7 +63,7 @@ impl Lights {
         Ok((lights.views() > 0).then_some(lights))
     }
 
-    /// Number of photographs: the views of the dataset, of which only those trained on have a light of their own.
+    /// Number of photographs: all views of the dataset, of which only training views have a light of their own.
     pub fn views(&self) -> usize {
         let images = self.appearance.as_ref().map_or(0, |field| field.config.images);
         self.exposures.as_ref().map_or(images, Exposure::views)
@@ -76,7 +76,7 @@ impl Lights {
 }
 
 impl Light<'_> {
-    /// Whether it adds colours at all.
+    /// Whether this light adds colours to splats.
     pub(crate) fn adds_colors(&self) -> bool {
         self.lights.appearance.is_some()
     }
@@ -87,7 +87,8 @@ impl Light<'_> {
         Some(lit_colors(field, self.view, center, surfaces))
     }
 
-    /// The frame `color` `[3, H, W]`, drawn by [`render_splats`](crate::model::render_splats) in this light, in the photograph's exposure.
+    /// Applies the photograph's exposure to the frame `color` `[3, H, W]`, which [`render_splats`](crate::model::render_splats) rendered in
+    /// this light.
     pub fn developed<'c>(&self, color: &'c [f32]) -> Cow<'c, [f32]> {
         let Some(exposures) = &self.lights.exposures else {
             return Cow::Borrowed(color);
@@ -158,7 +159,7 @@ mod tests {
                 sockets.render(engine, view, camera.into(), &options, &plan);
                 assert_close(&drawn, sockets.frame_color(engine), 1e-5);
                 render_splats(&splats, residual.as_deref(), None, &mut renderer, &camera, &options);
-                assert_ne!(drawn, renderer.color(), "the mean light is another");
+                assert_ne!(drawn, renderer.color(), "the mean light is different");
             }
         }
     }

@@ -3,7 +3,7 @@
 //! Constants are bytes per splat or pixel at the peak, from the sizes of the arrays, and checked against the peak memory of runs
 //! (RESULTS.md, "How much memory does a training need?").
 
-use crate::field_step::{ALL_PHOTOS, is_field};
+use crate::field_step::{ALL_PHOTOS, PHOTO_PIXEL, is_field};
 use crate::recipe::Recipe;
 use crate::trainer::TrainError;
 use irradia_measure::LpipsNet;
@@ -21,7 +21,7 @@ const INTERSECTION: usize = 64;
 const INTERSECTIONS: usize = 3;
 /// A copy of parameters, moments and statistics, from which a checkpoint is written in the background.
 const SAVING: usize = 4 * (3 * 59 + 6);
-/// A splat, in all.
+/// A splat, in total.
 const SPLAT: usize = STATE + FOOTPRINT + INTERSECTIONS * INTERSECTION + SAVING;
 /// A pixel of the largest photograph: frame, gradients, the maps of SSIM, and the intersections of a few thousand splats per tile.
 const PIXEL: usize = 300;
@@ -33,11 +33,11 @@ const FIELD: usize = 512 << 20;
 const POINT: usize = 15;
 /// Fraction of the memory, as a divisor, that photographs get before splats, if they need it.
 const PHOTO_SHARE: usize = 4;
-/// Photographs without which training would wait for each.
+/// Minimum number of photographs in memory: with fewer, training would wait for each.
 const FEW_PHOTOS: usize = 8;
 /// Fraction of the memory for photographs, as a divisor, that held-out ones may take if the free memory is unknown.
 const HELD_OUT_SHARE: usize = 8;
-/// For photographs if the free memory is unknown: 5,500 of 360 x 360.
+/// Memory for photographs if the free memory is unknown: 5,500 of 360 x 360.
 const UNKNOWN: usize = 2 << 30;
 
 /// The distribution of the memory of a process, bytes.
@@ -67,13 +67,13 @@ pub(crate) struct Needs {
     pub program: usize,
     /// Frames and losses, bytes.
     pub images: usize,
-    /// The photographs without which there is no step, and those being decoded, bytes.
+    /// The photographs that are needed for a step, and those being decoded, bytes.
     pub few_photos: usize,
     /// All photographs, and those being decoded, bytes.
     pub all_photos: usize,
     /// Held-out photographs, bytes.
     pub held_out: usize,
-    /// Splats to begin with.
+    /// Number of first splats.
     pub first_splats: usize,
     /// The recipe's limit for this dataset.
     pub most_splats: usize,
@@ -91,8 +91,7 @@ impl Needs {
             .map(|view| dataset.views[*view].photo.working_bytes())
             .max()
             .unwrap_or(0);
-        // Four channels, or three and a mask.
-        let bytes = |views: &[usize]| views.iter().map(|view| 4 * pixels(view)).sum::<usize>();
+        let bytes = |views: &[usize]| views.iter().map(|view| PHOTO_PIXEL * pixels(view)).sum::<usize>();
         let all = bytes(&dataset.train);
         let has_field = (0..recipe.stage.len()).any(|stage| is_field(recipe, stage));
         let all_at_once = has_field && all <= ALL_PHOTOS;
@@ -110,7 +109,7 @@ impl Needs {
                 + if all_at_once {
                     all
                 } else {
-                    all.min(FEW_PHOTOS * 4 * largest)
+                    all.min(FEW_PHOTOS * PHOTO_PIXEL * largest)
                 },
             all_photos: working + all,
             held_out: bytes(&dataset.test),
@@ -166,8 +165,8 @@ impl MemoryPlan {
         Ok(plan(splats, (2 * needs.all_photos).min(rest - held_out), held_out))
     }
 
-    /// The limit on the number of splats while a frame has `intersections` of splats and tiles with `splats` splats and `pixels`
-    /// pixels; more than were reserved reduce it.
+    /// The limit on the number of splats, given a frame of `pixels` pixels in which `splats` splats have `intersections` intersections with
+    /// tiles; more of these than were reserved reduce the limit.
     pub(crate) fn splats_at(&self, intersections: usize, splats: usize, pixels: usize) -> usize {
         let reserved = INTERSECTIONS * splats + pixels / 10;
         let excess = INTERSECTION * intersections.saturating_sub(reserved);
@@ -178,12 +177,12 @@ impl MemoryPlan {
         }
     }
 
-    /// What memory withholds from the recipe `name`: one line.
+    /// A warning, one line, if memory limits the splats of the recipe `name`.
     pub(crate) fn warning(&self, name: &str) -> Option<String> {
         let limit = self.limit.filter(|_| self.splats < self.wanted_splats)?;
         let more = SPLAT * (self.wanted_splats - self.splats);
         Some(format!(
-            "{} of memory allow {} splats where recipe {name} has up to {}: density control adds fewer; --memory {} allows all",
+            "{} of memory allows {} splats, but recipe {name} has up to {}: density control adds fewer; --memory {} allows all",
             in_gib(limit),
             self.splats,
             self.wanted_splats,
@@ -234,7 +233,7 @@ pub fn free() -> Option<usize> {
         let line = text.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
         Some(1024 * line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()?)
     })?;
-    // Files in the page cache count as used there, and give way.
+    // Files in the page cache count as used there, but they are evicted when memory is needed.
     let cached = || inactive_files(&read("/sys/fs/cgroup/memory.stat")?);
     let group = number("/sys/fs/cgroup/memory.max")
         .zip(number("/sys/fs/cgroup/memory.current"))

@@ -1,27 +1,27 @@
 //! Photographs that do not fit what the others agree on: wrong poses, or another scene.
 //!
-//! After the first fifth of a run the splats show what most photographs have in common, and have not yet bent themselves to the
-//! others. A photograph whose error is far beyond the usual spread of errors is then left out: what splats would do to please it, in
-//! its place or in another, harms every other view. Natural differences of errors (texture, depth of field, views at the border of the
-//! scene) stay below [`FACTOR`], or widen the spread.
+//! After the first fifth of a run the splats show what most photographs have in common, and have not yet adapted to the others. A
+//! photograph whose error is far beyond the usual spread of errors is then left out: what splats would do to fit it, in the place that it
+//! shows or elsewhere, harms every other view. Natural differences of errors (texture, depth of field, views at the border of the scene)
+//! stay below [`FACTOR`], or widen the spread.
 
 use crate::event::Event;
 use crate::robust::{median, spread};
 use crate::trainer::Trainer;
 
-/// Training views below which nothing is decided.
+/// Minimum number of training views for a decision.
 const MIN_VIEWS: usize = 8;
-/// Standard deviations of the ln errors, from their median, beyond which a photograph is a misfit: five wrong poses of fifty were at 7
-/// to 9 (of the ln squared errors), the oddest photographs of seven captures at 1.2 to 4.
+/// Number of standard deviations of the ln errors above their median beyond which a photograph is a misfit: five wrong poses of fifty were
+/// at 7 to 9 (of the ln squared errors), the most unusual photographs of seven captures at 1.2 to 4.
 const DEVIATIONS: f64 = 5.0;
-/// Factor over the median error that a misfit has at least: the wrong poses had 3.5 to 5.4, and 2.1 has been seen of a photograph that is right.
+/// Minimum factor of a misfit's error over the median: the wrong poses had 3.5 to 5.4, and a photograph with a correct pose has had 2.1.
 const FACTOR: f64 = 2.5;
-/// Factor over the median that the error of its better part has at least.
+/// Minimum factor over the median of a misfit's error over the pixels that fit best.
 const TRIMMED_FACTOR: f64 = 1.5;
-/// Largest share of misfits: with more of them it is not clear who is wrong.
+/// Maximum fraction of misfits: with more of them it is not clear which photographs are wrong.
 const MOST: f64 = 0.2;
 
-/// Those of `errors` that are far beyond the others' spread, worst first.
+/// The views whose `errors` are far beyond the others' spread, and the factors of these over the median, worst first.
 fn outliers(errors: &[(usize, f64)]) -> Vec<(usize, f64)> {
     let logs: Vec<f64> = errors.iter().map(|(_, error)| error.max(1e-9).ln()).collect();
     if logs.len() < MIN_VIEWS {
@@ -37,8 +37,8 @@ fn outliers(errors: &[(usize, f64)]) -> Vec<(usize, f64)> {
     found.iter().map(|(view, excess)| (*view, excess.exp())).collect()
 }
 
-/// Those of `errors`, over all pixels and over those that fit best, that are far beyond the others' in the first and beyond them in the
-/// second: a person before the camera makes a part of a photograph worse, a wrong pose all of it.
+/// The views whose error over all pixels is far beyond the others', and whose error over the pixels that fit best is beyond the others' as
+/// well: a person in front of the camera makes a part of a photograph worse, a wrong pose all of it.
 fn misfits(errors: &[(usize, [f64; 2])]) -> Vec<(usize, f64)> {
     let all: Vec<(usize, f64)> = errors.iter().map(|(view, [all, _])| (*view, *all)).collect();
     let mut found = outliers(&all);
@@ -50,7 +50,7 @@ fn misfits(errors: &[(usize, [f64; 2])]) -> Vec<(usize, f64)> {
 }
 
 impl Trainer {
-    /// Leaves out the photographs whose `errors`, over all pixels and over those that fit best, do not fit the others', and says which.
+    /// Leaves out the photographs whose `errors`, over all pixels and over those that fit best, are misfits, and reports their names.
     pub(crate) fn leave_out_misfits(&mut self, errors: &[(usize, [f64; 2])]) -> Option<Event> {
         let found = misfits(errors);
         if found.is_empty() {
@@ -88,7 +88,7 @@ mod tests {
             .map(|i| (i, 0.05 * f64::from(0.15 * rng.normal()).exp()))
             .collect();
         assert_eq!(outliers(&errors), []);
-        // A view of much detail.
+        // A view with much detail.
         errors[9].1 = 0.09;
         assert_eq!(outliers(&errors), []);
         for view in [3, 17, 40] {
@@ -101,7 +101,7 @@ mod tests {
         let wide: Vec<(usize, f64)> = (0..50).map(|i| (i, 0.05 * f64::from(rng.normal()).exp())).collect();
         assert_eq!(outliers(&wide), []);
         assert_eq!(outliers(&errors[..7]), []);
-        // A person before the camera: the rest of the photograph is as good as the others.
+        // A person in front of the camera: the rest of the photograph is as good as the others.
         let mut both: Vec<(usize, [f64; 2])> = errors
             .iter()
             .map(|(view, error)| (*view, [*error, 0.5 * error]))

@@ -21,8 +21,8 @@ pub enum Model<'a> {
     Field(Cow<'a, Field>),
 }
 
-/// Renders the view of `camera` into the buffers of `renderer`, with the colours that `residual` and `light` add; the light's exposure is left to
-/// [`Light::developed`].
+/// Renders the view of `camera` into the buffers of `renderer`, with the colours that `residual` and `light` add; the light's exposure is
+/// applied by [`Light::developed`].
 pub fn render_splats(
     splats: &Splats,
     residual: Option<&Field>,

@@ -1,7 +1,7 @@
-//! Normals that were given beside photographs, by a network or a renderer, as the reference of a loss.
+//! Normal maps given with photographs, from a network or a renderer, as the reference of a loss.
 //!
-//! Files have them in the camera's axes, as OpenCV or as OpenGL has these, or in those of the world, and do not say which. A surface that a photograph
-//! shows faces the camera: in which axes most of the normals do is what all maps of a dataset have.
+//! Files contain them in the camera's axes, by the convention of OpenCV or of OpenGL, or in the world's axes, and do not say which. A
+//! surface that a photograph shows faces the camera: all maps of a dataset are taken to be in the axes in which most of the normals do.
 
 use crate::recipe::Param;
 use crate::schedule::StepPlan;
@@ -11,11 +11,11 @@ use irradia_measure::NormalSample;
 use irradia_scene::{Camera, Dataset, NormalGrid};
 use rayon::prelude::*;
 
-/// Length of a normal from which it is known.
+/// Minimum length of a known normal.
 const KNOWN: f32 = 0.5;
-/// Share of the normals that must face the cameras.
+/// Minimum fraction of the normals that face the cameras.
 const FACING: f64 = 0.9;
-/// Difference of two such shares that tells nothing.
+/// Difference up to which two such fractions count as equal.
 const EQUAL: f64 = 0.01;
 
 /// The maps of a dataset's training views, in their cameras' axes (x right, y down, z forward).
@@ -27,7 +27,7 @@ pub(crate) struct NormalMaps {
     pub summary: String,
 }
 
-/// What a map's axes are.
+/// The axes of a map's normals.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Axes {
     /// x right, y down, z forward.
@@ -80,7 +80,7 @@ impl NormalMaps {
             .map(|error| format!("; {error}"));
         let mut maps: Vec<(usize, NormalGrid)> = maps.into_iter().filter_map(|(i, map)| Some((i, map.ok()?))).collect();
         let shares = Axes::ALL.map(|axes| (axes, facing(dataset, &maps, axes)));
-        // Of equal ones the first: normals in a camera's axes may well face it if they are taken for the world's, but hardly the reverse.
+        // The first of equal ones: normals in a camera's axes may well face it if they are taken for the world's, but hardly the reverse.
         let (axes, share) = shares
             .into_iter()
             .reduce(|best, next| if next.1 > best.1 + EQUAL { next } else { best })
@@ -101,7 +101,7 @@ impl NormalMaps {
         let found = match share >= FACING {
             true => axes.name().to_owned(),
             false => format!(
-                "{:.0} % of their normals face the cameras in no axes that are known",
+                "at most {:.0} % of their normals face the cameras in any known axes",
                 100.0 * share
             ),
         };
@@ -114,12 +114,12 @@ impl NormalMaps {
         }
     }
 
-    /// Whether any map counts.
+    /// Whether no map can be used.
     pub fn is_empty(&self) -> bool {
         self.of.iter().all(Option::is_none)
     }
 
-    /// The normals of `view` at the pixels of `camera`, and half of their distance from one another, pixels.
+    /// The normals of `view` at the pixels of `camera`, and half of their spacing, pixels.
     pub fn samples(&self, view: usize, camera: &Camera) -> Option<(Vec<NormalSample>, u32)> {
         let grid = self.of.get(view)?.as_ref()?;
         let k = &camera.intrinsics;
@@ -131,7 +131,7 @@ impl NormalMaps {
     }
 }
 
-/// The share of the normals of `maps` that face their cameras in `axes`.
+/// The fraction of the normals of `maps` that face their cameras if they are in `axes`.
 fn facing(dataset: &Dataset, maps: &[(usize, NormalGrid)], axes: Axes) -> f64 {
     let (mut facing, mut known) = (0usize, 0usize);
     for (view, map) in maps {
@@ -150,7 +150,7 @@ fn facing(dataset: &Dataset, maps: &[(usize, NormalGrid)], axes: Axes) -> f64 {
 }
 
 impl Trainer {
-    /// Normals of the map that was given beside the photograph of view `view`, if the plan uses them.
+    /// Normals of the map given with the photograph of view `view`, if the plan uses them.
     pub(crate) fn given_normals(
         &mut self,
         view: usize,
@@ -173,7 +173,7 @@ mod tests {
     use irradia_scene::{GridSource, Intrinsics, LoadError, Photo, Pose, Rng, View};
     use std::sync::Arc;
 
-    /// Cells of each side.
+    /// Number of cells along each side.
     const CELLS: u32 = 8;
 
     struct Broken;
@@ -184,7 +184,8 @@ mod tests {
         }
     }
 
-    /// Two cameras, to the left and to the right of each other, that look down at a floor, whose normals are given by `of` the world's and the camera.
+    /// Two cameras side by side that look down at a floor. `of` computes the normals of a map from the floor's normal, world, and the
+    /// camera.
     fn dataset(of: impl Fn(Vec3, &Camera) -> [f32; 3]) -> Dataset {
         let view = |i: i32| {
             let rotation = Quat::from_rotation_y(0.8 * i as f32) * Quat::from_rotation_x(-0.7);
@@ -246,7 +247,7 @@ mod tests {
                         .iter()
                         .all(|sample| Vec3::from_array(sample.normal).distance(wanted) < 1e-5)
                 );
-                // At the middles of the cells.
+                // At the centres of the cells.
                 let [x, y] = samples[CELLS as usize + 2].pixel;
                 assert_eq!(Vec2::new(x as f32, y as f32), Vec2::new(20.0, 12.0));
             }

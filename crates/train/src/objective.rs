@@ -15,14 +15,14 @@ use std::sync::Arc;
 
 /// Side of the random LPIPS crop of a step, pixels.
 pub(crate) const PATCH: usize = 128;
-/// Share of the pixels by which a photograph is compared with the others: a person before the camera makes the rest worse, a wrong pose
-/// makes all of them worse.
+/// Fraction of the pixels, those that fit best, by which photographs are compared: a person in front of the camera makes only the other
+/// pixels worse, a wrong pose makes all of them worse.
 const TRIMMED: f32 = 0.7;
 /// Edge sensitivity of depth smoothness: a colour edge of 0.1 reduces it to 1 / e (Godard et al. 2017 use 1 for colours normalised
 /// differently).
 const EDGE_SHARPNESS: f32 = 10.0;
 
-/// All losses with their working memory, and the gradients of the last frame.
+/// All losses with their buffers, and the gradients of the last frame.
 pub struct Objective {
     /// Weights of the perceptual loss, which is skipped without them.
     pub lpips: Option<Arc<Lpips>>,
@@ -66,14 +66,14 @@ pub struct Reference<'a> {
     pub background: Option<[f32; 3]>,
     /// Known depths.
     pub depths: &'a [DepthSample],
-    /// Those of a map given beside the photograph.
+    /// Depths from a map given with the photograph.
     pub depth_map: Option<(&'a [DepthSample], DepthKind)>,
-    /// Normals of a map given beside the photograph, half of their distance from one another in pixels, and the camera.
+    /// Normals from a map given with the photograph, half of their spacing in pixels, and the camera.
     pub normal_map: Option<(&'a [NormalSample], u32, &'a Intrinsics)>,
 }
 
 impl Objective {
-    /// With no frame evaluated.
+    /// An objective that has not evaluated a frame yet.
     pub fn new(lpips: Option<Arc<Lpips>>) -> Self {
         Self {
             lpips,
@@ -91,7 +91,7 @@ impl Objective {
         }
     }
 
-    /// Evaluates `frame`; if depth has a weight it must have been rendered with depth.
+    /// Evaluates `frame`, which must have been rendered with depth if a loss on depth has a weight.
     pub fn evaluate(
         &mut self,
         frame: FramePlanes,
@@ -241,8 +241,8 @@ impl Objective {
         }
     }
 
-    /// The mean of the result of [`Objective::error`] over the pixels of `photo` that are neither masked nor transparent, and over the [`TRIMMED`] best of
-    /// them; 0 without any.
+    /// The mean of the result of [`Objective::error`] over the pixels of `photo` that are neither masked nor transparent, and over the
+    /// fraction [`TRIMMED`] of them that fits best; 0 if there are none.
     pub fn mean_errors(&self, photo: &Prepared) -> [f64; 2] {
         let shown = |plane: &Option<Vec<u8>>, at: usize| plane.as_ref().is_none_or(|values| values[at] != 0);
         let counts = |at: &usize| shown(&photo.mask, *at) && shown(&photo.alpha, *at);
@@ -261,7 +261,7 @@ impl Objective {
         &mut self.v_color
     }
 
-    /// The gradients of the colour last evaluated, and of the coverage to add to: `[3, H, W]` and `[H, W]`.
+    /// The gradient of the colour last evaluated, `[3, H, W]`, and that of the coverage, `[H, W]`, for the caller to add to.
     pub fn v_color_and_alpha(&mut self) -> (&[f32], &mut [f32]) {
         if !self.has.alpha {
             self.has.alpha = true;
@@ -294,13 +294,13 @@ pub(crate) fn photometric_weights(plan: &StepPlan) -> LossWeights {
     }
 }
 
-/// Makes `plane` one of `pixels` zeros.
+/// Resets `plane` to `pixels` zeros.
 fn clear(plane: &mut Vec<f32>, pixels: usize) {
     plane.clear();
     plane.resize(pixels, 0.0);
 }
 
-/// The weight of the coverage of `photo`: photographs with alpha show what is empty.
+/// The weight of the coverage of `photo`: 0 for a photograph with alpha, which shows what is empty.
 pub(crate) fn cover_weight(photo: &Prepared, plan: &StepPlan) -> f32 {
     match photo.alpha {
         Some(_) => 0.0,
@@ -322,8 +322,9 @@ fn compare_alpha(got: &[f32], want: &[u8], weight: f32, v_alpha: &mut [f32]) -> 
     f64::from(weight) * sum
 }
 
-/// Mean alpha of what `mask` leaves out, over all pixels, weighted; adds its gradient to `v_alpha`. Outlines of masks are rarely exact, and what they keep beside
-/// an object may be empty as well.
+/// Sum of alpha over the pixels that `mask` leaves out, divided by the number of all pixels, weighted; adds its gradient to `v_alpha`.
+/// Pixels that the mask keeps have no target: outlines of masks are rarely exact, and what they keep next to an object may be empty as
+/// well.
 fn clear_masked(alpha: &[f32], mask: &[u8], weight: f32, v_alpha: &mut [f32]) -> f64 {
     let weight = weight / alpha.len() as f32;
     let mut sum = 0.0f64;

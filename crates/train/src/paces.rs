@@ -1,4 +1,4 @@
-//! The pace of each step of a run: with a budget it depends on the clock, and with it all results of training.
+//! The pace of each step of a run. With a budget it depends on the wall clock, and so do all results of training.
 
 /// Paces in the order of steps: each holds from its step until the next pair. A run that repeats them writes the same bytes as
 /// the original run, independent of the clock.
@@ -10,7 +10,7 @@ impl Paces {
     /// and is ignored.
     ///
     /// # Errors
-    /// One line that names the number of the invalid line, or says that there are no lines.
+    /// One line with the number of the first invalid line, or saying that the steps do not ascend from 1, as when there are no lines.
     pub fn parse(text: &str) -> Result<Self, String> {
         let whole = text.rfind('\n').map_or("", |end| &text[..end]);
         let pair = |(number, line): (usize, &str)| {
@@ -33,7 +33,7 @@ impl Paces {
         format!("{step} {pace}\n")
     }
 
-    /// The pace of `step`, from 1; after the last pair, its pace.
+    /// The pace of `step`, counted from 1; after the last pair, the pace of that pair.
     pub(crate) fn at(&self, step: u64) -> Option<f64> {
         let next = self.0.partition_point(|(first, _)| *first <= step);
         Some(self.0[next.checked_sub(1)?].1)

@@ -1,4 +1,4 @@
-//! Renders one model again and again.
+//! Renders one model repeatedly.
 
 #[cfg(feature = "gpu")]
 use crate::model::of_field;
@@ -12,7 +12,7 @@ use {
     irradia_splat::GpuRenderer,
 };
 
-/// Renders a model on a device: on a GPU, if it has a form there.
+/// Renders a model on a device: on a GPU, if the GPU supports the model.
 pub struct Painter<'m> {
     model: &'m Model<'m>,
     renderer: Renderer,
@@ -27,7 +27,7 @@ enum OnGpu {
 }
 
 impl<'m> Painter<'m> {
-    /// For `model`, which is uploaded once.
+    /// A painter of `model`, which is uploaded once.
     ///
     /// # Errors
     /// When the device refuses the kernels, or has too little memory for the model.

@@ -8,7 +8,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Photographs loaded ahead if not all fit into the budget, for each loading thread: enough for a few slow ones.
+/// Number of photographs loaded ahead per loading thread if not all fit into the budget: enough to bridge a few slow ones.
 const AHEAD: usize = 8;
 /// Fraction of the budget, as a divisor, that photographs being decoded may use.
 const WORKING_SHARE: usize = 4;
@@ -59,7 +59,7 @@ impl Prepared {
     }
 }
 
-/// What is in memory of a photograph.
+/// The parts of a photograph that are in memory.
 #[derive(Default)]
 struct Held {
     /// At the current scale.
@@ -88,7 +88,7 @@ pub struct PhotoCache {
     fits: bool,
     /// Whether all of them were loaded once.
     all_seen: bool,
-    /// Whether they also fit at full size beside those of `scale`.
+    /// Whether they also fit at full size, in addition to those at `scale`.
     keeps_full: bool,
     threads: usize,
     /// Photographs loaded ahead if not all fit: at most half of those that do, so that the others may stay until they are needed.
@@ -99,7 +99,7 @@ pub struct PhotoCache {
 }
 
 impl PhotoCache {
-    /// Uses at most `budget` bytes, those being decoded included, but holds at least the current photograph.
+    /// Uses at most `budget` bytes, including photographs being decoded, but always holds the current photograph.
     pub fn new(dataset: Arc<Dataset>, background: [f32; 3], budget: usize) -> Self {
         let working = dataset
             .views
@@ -132,9 +132,9 @@ impl PhotoCache {
         std::mem::take(&mut self.seconds)
     }
 
-    /// The photograph of view `upcoming[0]` at `scale`; waits until it is loaded. The next ones are loaded meanwhile, as far as
-    /// there is room; for it, those needed last, or not at all, are evicted. If all fit, none is loaded twice, and the first call
-    /// waits for all, so that a damaged file ends a run before its first step.
+    /// The photograph of view `upcoming[0]` at `scale`; waits until it is loaded. The next ones are loaded meanwhile, as far as there is
+    /// room; to make room, those needed last, or not at all, are evicted. If all fit, none is loaded twice, and the first call waits for
+    /// all, so that a damaged file ends a run before its first step.
     ///
     /// # Errors
     /// When a photograph, this one or one loaded ahead, cannot be read.
@@ -154,7 +154,7 @@ impl PhotoCache {
                 return Ok(self.held[&upcoming[0]].prepared.clone().expect("it is there"));
             }
             if all && self.loader.is_idle() {
-                // Masks beside alpha take more than was assumed: not all fit.
+                // Masks in addition to alpha take more than was assumed: not all fit.
                 all = false;
                 continue;
             }
@@ -163,7 +163,7 @@ impl PhotoCache {
         }
     }
 
-    /// From now on, photographs are needed at `scale`. Pixels at full size stay in memory, if they are there.
+    /// Changes the scale of photographs to `scale`. Pixels at full size stay in memory, if they are there.
     fn use_scale(&mut self, scale: f32) {
         self.scale = scale;
         let total = |scale: f32| -> usize { self.dataset.train.iter().map(|view| self.size(*view, scale)).sum() };
@@ -190,20 +190,20 @@ impl PhotoCache {
         self.held.get(view).is_some_and(|held| held.prepared.is_some())
     }
 
-    /// Bytes to reserve for loading view `view`, beyond what is in memory of it.
+    /// Bytes to reserve for loading view `view`, beyond what is in memory already.
     fn reserved(&self, view: usize) -> usize {
         let full = if self.keeps_full { self.size(view, 1.0) } else { 0 };
         let held = self.held.get(&view).map_or(0, Held::bytes);
         (self.size(view, self.scale) + full).saturating_sub(held)
     }
 
-    /// Stores what was loaded; waits for something if `wait`.
+    /// Stores the photographs that were loaded; waits for at least one if `wait`.
     fn keep(&mut self, wait: bool) -> Result<(), LoadError> {
         for Loaded { view, scale, result } in self.loader.take(wait) {
             let (prepared, full) = result?;
             let held = self.held.entry(view).or_default();
             self.bytes -= held.bytes();
-            // What was loaded for an earlier scale may serve at full size.
+            // A photograph loaded for an earlier scale may still be of use at full size.
             held.full = full.filter(|_| self.keeps_full);
             if scale == self.scale {
                 held.prepared = Some(prepared);

@@ -8,7 +8,8 @@ use irradia_scene::{Dataset, View};
 use irradia_splat::init;
 use rayon::prelude::*;
 
-/// The width that a pixel covers at the depth of what a training view shows, world units: the median over views, of which there is at least one.
+/// The width that a pixel covers at the depth of what a training view shows, world units: the median over views, of which there must be at
+/// least one.
 pub(crate) fn pixel_size(dataset: &Dataset) -> f32 {
     let focus = init::focus_point(&train_cameras(dataset));
     let size = |view: &usize| {

@@ -1,12 +1,12 @@
-//! Statistics that a few odd values do not move.
+//! Statistics that are robust to a few outliers.
 
-/// The middle of the sorted `values`; the upper one of an even number. At least one value.
+/// The median of `values`; the upper of the two middle ones if their number is even. There must be at least one value.
 pub(crate) fn median(mut values: Vec<f64>) -> f64 {
     let middle = values.len() / 2;
     *values.select_nth_unstable_by(middle, f64::total_cmp).1
 }
 
-/// The standard deviation of the normal distribution whose `deviations` have this median absolute value.
+/// The standard deviation, estimated from the median absolute value of `deviations` as for a normal distribution.
 pub(crate) fn spread(deviations: impl Iterator<Item = f64>) -> f64 {
     1.4826 * median(deviations.map(f64::abs).collect())
 }

@@ -21,13 +21,14 @@ pub struct RunLimits {
     pub paces: Option<Paces>,
 }
 
-/// The share of its budget that a run uses up, unless it ends early.
+/// Fraction of its budget below which a run has ended early.
 const EARLY: f64 = 0.9;
 
 /// Steps between evaluations of the held-out views for `until_psnr`.
 const UNTIL_PSNR_EVERY: u64 = 50;
 
-/// Held-out views that an evaluation during training has at most: all 200 of a Blender scene took longer than the steps between them.
+/// Maximum number of held-out views of an evaluation during training: all 200 of a Blender scene took longer than the steps between
+/// evaluations.
 const MOST_EVALUATED: usize = 32;
 
 /// Interval at which observers of a paused run are polled: imperceptible to a person, and a negligible load.
@@ -116,7 +117,7 @@ pub fn run(
             let started = Instant::now();
             let views = match limits.until_psnr {
                 None => some_of(&trainer.dataset.test),
-                // Which is that of all views.
+                // The limit is on the PSNR of all views.
                 Some(_) => trainer.dataset.test.clone(),
             };
             let psnr = held_out_psnr(trainer, &views, observers)?;
@@ -166,40 +167,40 @@ pub fn run(
     Ok(reason)
 }
 
-/// What became of the first splats, where a run ends with fewer: a warning where hardly any are left.
+/// What became of the first splats, if a run ends with fewer; a warning if hardly any are left.
 fn fewer_than_at_first(trainer: &Trainer) -> Option<Event> {
     let (first, last) = (trainer.splats_at_first, trainer.engine.len());
     if trainer.field.is_some() || !trainer.finished() || last >= first {
         return None;
     }
-    let left = format!("{last} splats are left of {first} at first: the others faded or showed in no photograph");
+    let left = format!("{last} of initially {first} splats are left: the others faded or appeared in no photograph");
     Some(if 10 * last < first {
         Event::Warned {
-            message: format!("{left}; if the scene is a blur, photographs disagree (light, poses, moving objects)"),
+            message: format!("{left}; if the scene is blurred, photographs disagree (light, poses, moving objects)"),
         }
     } else {
         Event::Decided { message: left }
     })
 }
 
-/// Why a run ended before its budget of so many seconds was used up.
+/// Why a run ended before its `budget`, in seconds, was used up.
 fn ended_early(trainer: &Trainer, budget: f64) -> Option<Event> {
     let (steps, seconds) = (trainer.clock.step, trainer.seconds);
     let is_limited = trainer.finished() && trainer.pace == trainer.least_pace();
     (is_limited && seconds < EARLY * budget).then(|| Event::Decided {
         message: format!(
-            "{seconds:.0} s of {budget:.0} were needed: more than {steps} steps would fit single photographs, which are this far apart (--steps for \
-             another number)"
+            "{seconds:.0} s of {budget:.0} were needed: photographs are so far apart that more than {steps} steps would only \
+             fit single ones (--steps sets another number)"
         ),
     })
 }
 
-/// How many steps had losses that only the CPU computes, though the splats are on a GPU.
+/// How many steps had losses that only the CPU computes, although the splats are on a GPU.
 fn read_for_losses(trainer: &Trainer) -> Option<Event> {
     let (steps, device) = (trainer.read_for_losses, &trainer.options.device);
     (steps > 0).then(|| Event::Warned {
         message: format!(
-            "the losses of {steps} steps were computed on the CPU, from frames read back from {device}: recipe {} has some that the GPU \
+            "the losses of {steps} steps were computed on the CPU, from frames read back from {device}: recipe {} uses some that the GPU \
              lacks (docs/gpu.md)",
             trainer.recipe.name
         ),
@@ -261,7 +262,7 @@ fn wait_while_paused(
     requests.stop |= tell(trainer, events, observers).stop;
 }
 
-/// [`MOST_EVALUATED`] of `views` at most, evenly chosen.
+/// At most [`MOST_EVALUATED`] of `views`, evenly spaced.
 fn some_of(views: &[usize]) -> Vec<usize> {
     let count = views.len().min(MOST_EVALUATED);
     (0..count).map(|i| views[i * views.len() / count]).collect()

@@ -1,4 +1,5 @@
-//! How far photographs are apart, as seen from what they show: what stands between sparse ones, only a few of them determine.
+//! The angle between adjacent photographs, as seen from what they show. If it is large, only a few photographs determine what lies between
+//! them.
 
 use crate::pixel_size::depth_shown;
 use crate::robust::median;
@@ -12,8 +13,8 @@ use std::f64::consts::PI;
 /// Cameras closer than this fraction of the depth are at the same place, as the faces of a panorama are.
 const SAME_PLACE: f32 = 1e-3;
 
-/// The angle, radians, between a training view's axis and the line from where it ends to the nearest other camera that sees this point: the median over
-/// views; half a turn for those of which no other sees it.
+/// The angle between adjacent photographs, radians: at the point on a view's axis that is as deep as what the view shows, the smallest
+/// angle between its camera and another one that sees the point; pi if no other one does. The median over the training views.
 pub(crate) fn spacing(dataset: &Dataset) -> f64 {
     let cameras = train_cameras(dataset);
     let focus = init::focus_point(&cameras);
@@ -77,7 +78,7 @@ pub(crate) mod tests {
         }));
         let expected = f64::from(TAU) / 12.0;
         assert!((spacing(&data) - expected).abs() < 0.02 * expected);
-        // Of what is outside, no other camera sees what one looks at.
+        // Outwards, no other camera sees what a camera looks at.
         data.train = (12..24).step_by(2).collect();
         assert_eq!(spacing(&data), PI);
     }

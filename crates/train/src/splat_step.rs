@@ -149,7 +149,7 @@ impl Trainer {
     fn update(&self, plan: &StepPlan, view: usize, camera: &Camera) -> Update {
         let longer = self.pace.min(1.0).powf(f64::from(self.recipe.length_exponent)) as f32;
         let mut rates = plan.rates().scaled(longer);
-        // Of what is as far away as most of the scene.
+        // The rate at the depth of most of the scene.
         let typical_rate = rates.means * self.extent_of_rate;
         if self.recipe.extent_pixels > 0.0 {
             let k = &self.dataset.views[view].camera.intrinsics;

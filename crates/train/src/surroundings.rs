@@ -1,10 +1,11 @@
-//! What only one of sparse photographs shows of the surroundings of a scene. Its distance is unknown, and where photographs are taken around an object, splats that
-//! explain it may stand among the cameras on the far side, where they are all that is seen from places between these. They go far away, on the rays of their photograph,
-//! which shows the same: nothing stands where cameras are.
+//! Splats of a scene's surroundings that only one of sparse photographs shows. Their distance is unknown, and where photographs are taken
+//! around an object, they may end up among the cameras on the far side, where they are all that is seen from places between these. They are
+//! moved far away along the rays of their photograph, in which they look the same, because space is empty where cameras are.
 //!
-//! Held-out PSNR of `fast`, 480 pixels, without and with it, means of three seeds: a box on a table, 16 photographs 30 degrees apart, 17.35 and 19.03 dB (one of three held-out views
-//! was grey fog). At 320 pixels, with others held out, in which there was none, 18.1 and 17.9 (nine runs, whose spread is 0.7); twenty captures cut down to 3 to 13 photographs -0.01 dB in
-//! the mean. If splats near points go as well, a fox before a wall, 8 photographs, loses 0.7 dB, since the wall is near cameras.
+//! Held-out PSNR of `fast`, 480 pixels, without and with it, means of three seeds: a box on a table, 16 photographs 30 degrees apart, 17.35
+//! and 19.03 dB (one of three held-out views was grey fog). At 320 pixels, with other views held out, in which there was no fog, 18.1 and
+//! 17.9 dB (nine runs, whose spread is 0.7); twenty captures reduced to 3 to 13 photographs, -0.01 dB in the mean. If splats near points
+//! are moved as well, a fox in front of a wall, 8 photographs, loses 0.7 dB, since the wall is near cameras.
 
 use crate::conditions::SPARSE;
 use crate::robust::median;
@@ -14,19 +15,20 @@ use irradia_scene::{Camera, Dataset};
 use irradia_splat::{SplatState, init};
 use rayon::prelude::*;
 
-/// Distances in units of that of the cameras from their focus, in the median. From the focus: that from which splats may be among the cameras.
+/// Distance from the focus beyond which splats may be among the cameras. This and the following distances are in units of the cameras'
+/// median distance from their focus.
 const OUTSIDE: f32 = 0.6;
-/// Of the nearest camera of a splat among them.
+/// Distance to the nearest camera below which a splat is among the cameras.
 const BESIDE: f32 = 1.2;
-/// Of the nearest point of what is known.
+/// Distance to the nearest point below which the place of a splat is known.
 const KNOWN: f32 = 0.3;
-/// From the focus: where splats go.
+/// Distance from the focus to which splats are moved.
 const FAR: f32 = 3.0;
 
-/// The cameras of sparse photographs, and what they show for certain.
+/// The cameras of sparse photographs, and the points that are known.
 #[derive(Clone, Debug)]
 pub(crate) struct Surroundings {
-    /// Of the training photographs, at full size.
+    /// Cameras of the training photographs, at full size.
     cameras: Vec<Camera>,
     points: Vec<Vec3>,
     focus: Vec3,
@@ -35,7 +37,7 @@ pub(crate) struct Surroundings {
 }
 
 impl Surroundings {
-    /// Of photographs `spacing` radians apart; `None` if that is close, or no points are known.
+    /// The surroundings of photographs that are `spacing` radians apart; `None` if they are close, or no points are known.
     pub(crate) fn new(dataset: &Dataset, spacing: f64) -> Option<Self> {
         let points = dataset.points.as_ref()?.positions.clone();
         if points.is_empty() || spacing.to_degrees() < SPARSE {
@@ -52,7 +54,7 @@ impl Surroundings {
         })
     }
 
-    /// Moves the splats far away that only one photograph shows, beyond the focus and among other cameras. Returns their number.
+    /// Moves splats far away if only one photograph shows them, beyond the focus and among other cameras. Returns their number.
     pub(crate) fn move_away(&self, state: &mut SplatState) -> usize {
         let splats = &mut state.splats;
         let moved: Vec<(usize, Vec3, f32)> = (0..splats.len())
@@ -74,7 +76,8 @@ impl Surroundings {
         moved.len()
     }
 
-    /// For a splat at `position` whose distance is unknown, the only camera that sees it, and how many times as far from it the splat may be as well.
+    /// For a splat at `position` whose distance is unknown, the position of the only camera that sees it, and the factor on its distance
+    /// from that camera that moves it to the distance [`FAR`] from the focus.
     fn unknown(&self, position: Vec3) -> Option<(Vec3, f32)> {
         let [outside, beside, known, far] = [OUTSIDE, BESIDE, KNOWN, FAR].map(|times| times * self.distance);
         let is_within = |place: Vec3, reach: f32| place.distance_squared(position) < reach * reach;
@@ -140,7 +143,7 @@ mod tests {
     fn what_one_photograph_shows_among_the_cameras_goes_far_away_and_looks_the_same() {
         let data = around(5);
         let surroundings = Surroundings::new(&data, spacing(&data)).unwrap();
-        // Opposite to the first camera, between the third and the fourth one.
+        // Opposite the first camera, between the third and the fourth.
         let mut state = state(&[Vec3::new(-1.0, 0.05, 0.02)]);
         assert_eq!(surroundings.move_away(&mut state), 1);
         let moved = Vec3::from_array(state.splats.mean(0));

@@ -1,4 +1,4 @@
-//! Named tensors in safetensors files: of checkpoints, and of files beside a scene.
+//! Named tensors in safetensors files: in checkpoints, and in the files beside a scene.
 
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use std::collections::HashMap;
@@ -45,7 +45,7 @@ impl NamedTensor {
         }
     }
 
-    /// The same under a longer name.
+    /// The same tensor, with `prefix` before its name.
     pub fn prefixed(self, prefix: &str) -> Self {
         let name = format!("{prefix}{}", self.name);
         Self { name, ..self }

@@ -1,4 +1,5 @@
-//! Start here: the whole state of a run, and [`Trainer::step`], which advances it; what a step does is in `splat_step.rs` and `field_step.rs`.
+//! Start here: the whole state of a run, and [`Trainer::step`], which advances it; what a step does is in `splat_step.rs` and
+//! `field_step.rs`.
 
 use crate::depth_maps::DepthMaps;
 use crate::device::{DeviceLoss, use_device};
@@ -61,7 +62,7 @@ pub enum TrainError {
     Field(#[from] FieldError),
     /// The first splats and a few photographs do not fit into memory.
     #[error(
-        "{limit} of memory are too little for {splats} splats and a few photographs; --memory {needed} would do{otherwise}"
+        "{limit} of memory is too little for {splats} splats and a few photographs; --memory {needed} would be enough{otherwise}"
     )]
     Memory {
         /// All memory of the process, with its unit.
@@ -70,7 +71,7 @@ pub enum TrainError {
         needed: String,
         /// Splats to begin with.
         splats: usize,
-        /// What else would do.
+        /// An alternative, as the end of the sentence.
         otherwise: String,
     },
     /// The device cannot be used, or failed.
@@ -81,18 +82,18 @@ pub enum TrainError {
     Checkpoint(String),
 }
 
-/// Options of a run beside its recipe.
+/// Options of a run in addition to its recipe.
 #[derive(Clone)]
 pub struct TrainOptions {
     /// Random seed.
     pub seed: u64,
     /// Steps of the run; the recipe's own number when `None`.
     pub steps: Option<u64>,
-    /// Memory of the whole process, bytes; `None`: photographs get 2 GiB, and splats have the recipe's limit only.
+    /// Memory of the whole process, bytes; `None`: photographs get 2 GiB, and splats have only the recipe's limit.
     pub memory: Option<usize>,
     /// Weights of the perceptual loss; without them a recipe's perceptual loss is skipped.
     pub lpips: Option<Arc<Lpips>>,
-    /// Where the scene is trained.
+    /// The device on which the scene is trained.
     pub device: Device,
 }
 
@@ -112,7 +113,7 @@ impl Default for TrainOptions {
 /// Random streams derived from the run's seed, one per use.
 pub(crate) const STREAM_INIT: u64 = 1;
 
-/// A run of sparse photographs has at least one part in this many of the recipe's own steps.
+/// A run of sparse photographs has at least the recipe's own number of steps divided by this.
 const LEAST_SPARSE: u64 = 5;
 
 /// A run's whole state.
@@ -123,13 +124,13 @@ pub struct Trainer {
     pub dataset: Arc<Dataset>,
     /// Indices of the views to train on: those of the dataset without misfits.
     pub(crate) trained: Vec<usize>,
-    /// What is hidden of the training views.
+    /// The hidden parts of the training views.
     pub(crate) hidden: Hidden,
     /// The splats; none while a field is trained.
     pub engine: Engine,
     /// The field, in stages that train one.
     pub field: Option<FieldEngine>,
-    /// The trained components beside the splats.
+    /// The trained components other than the splats.
     pub sockets: Sockets,
     /// Position in the schedule.
     pub clock: Clock,
@@ -139,7 +140,8 @@ pub struct Trainer {
     pub pace: f64,
     /// Extent of the scene, world units: 1.1 times the largest distance of a camera from their mean (3DGS).
     pub extent: f32,
-    /// What the rate of the means is relative to, world units: the extent, or a number of pixels at the depth of what most views show.
+    /// The length to which the rate of the means is relative, world units: the extent, or a number of pixels at the depth of what most
+    /// views show.
     pub(crate) extent_of_rate: f32,
     /// Wall time of all steps so far, excluding the loading of photographs and the evaluation of held-out views.
     pub seconds: f64,
@@ -156,9 +158,9 @@ pub struct Trainer {
     /// The distribution of the memory.
     pub memory: MemoryPlan,
     pub(crate) photos: PhotoCache,
-    /// The maps of depth given beside photographs, once they are needed.
+    /// The depth maps given with photographs; read once they are needed.
     pub(crate) depth_maps: Option<DepthMaps>,
-    /// Those of normals.
+    /// The normal maps, likewise.
     pub(crate) normal_maps: Option<NormalMaps>,
     /// Known depths of the views on which a field is trained, by view, width and height.
     pub(crate) depths: HashMap<(usize, u32, u32), Arc<[KnownDepth]>>,
@@ -167,11 +169,11 @@ pub struct Trainer {
     /// Steps of this process whose frames were read back from a GPU for their losses.
     pub(crate) read_for_losses: u64,
     pub(crate) free_space: FreeSpace,
-    /// Splats before the first step, or, if fewer, before the first since the run was resumed: edits may have removed some.
+    /// Number of splats before the first step, or, if fewer, before the first step since the run was resumed: edits may have removed some.
     pub(crate) splats_at_first: usize,
     /// Angle between adjacent training photographs, radians.
     pub(crate) spacing: f64,
-    /// What sparse photographs show; absent if the recipe has no free space.
+    /// The surroundings of sparse photographs; absent if the recipe has no free space.
     pub(crate) surroundings: Option<Surroundings>,
 }
 
@@ -184,7 +186,7 @@ impl Trainer {
         let first = first_count(&dataset, &recipe);
         let mut trainer = Self::unfilled(dataset, recipe, options, first)?;
         if trainer.memory.splats < trainer.memory.wanted_splats {
-            // In the recipe, so that a resumed run has the same limit.
+            // Stored in the recipe, so that a resumed run has the same limit.
             trainer.recipe.max_splats = trainer.memory.splats;
         }
         trainer.settle_conditions()?;
@@ -312,7 +314,7 @@ impl Trainer {
         if self.engine.is_on_gpu() && self.recipe.light().is_some() {
             self.recipe.appearance = None;
             self.decisions
-                .push("the light of photographs is trained on the CPU only, and left out".into());
+                .push("the light of photographs can be trained on the CPU only, and is left out".into());
         }
         // Only the spaces of fields depend on transparency; photographs are not read for the others.
         let fields = self.recipe.residual.is_some() || self.recipe.light().is_some();
@@ -330,7 +332,7 @@ impl Trainer {
         Ok(self.photos.get(&self.dataset.train[..1], 1.0)?.alpha.is_some())
     }
 
-    /// The least pace of a run without a given number of steps: the recipe's limit on visits.
+    /// The minimum pace of a run without a given number of steps, by the limit on steps per training photograph.
     pub(crate) fn least_pace(&self) -> f64 {
         match self.most_visits() {
             0 => 0.0,
@@ -379,7 +381,7 @@ impl Trainer {
         let entered = self.tick(metrics) && !self.finished();
         let total = self.recipe.total_steps() as f64;
         let at = exposure_probe::AT * total;
-        // A grid contains an exposure: there is nothing to decide.
+        // A bilateral grid contains an exposure: there is nothing to decide.
         let undecided = self.recipe.exposure == Choice::Auto && self.sockets.bilateral.is_none();
         let probes = undecided && self.field.is_none();
         if probes && before < at && self.clock.time >= at {
@@ -420,7 +422,8 @@ impl Trainer {
         camera
     }
 
-    /// What both kinds of step report of the one that was just made, on `view`; the time left is not known yet, and splats are the caller's.
+    /// The common part of the reports of both kinds of step, for the step just made on `view`; the caller fills in the time left and the
+    /// splats.
     pub(crate) fn step_report(&self, view: usize, loss: f64, mse: f64) -> StepReport {
         StepReport {
             step: self.clock.step + 1,
@@ -438,15 +441,15 @@ impl Trainer {
         }
     }
 
-    /// The mean L1 error of the last frame against its photograph, where this shows something, and that of the pixels that fit best.
+    /// The mean L1 error of the last frame over the pixels that its photograph shows, and over those of them that fit best.
     pub(crate) fn errors_of_frame(&mut self, photo: &Prepared) -> [f64; 2] {
         let color = self.sockets.frame_color(&self.engine);
         self.objective.error(color, photo, false);
         self.objective.mean_errors(photo)
     }
 
-    /// Renders at most `most` training views, evenly spaced, as the plan does, with `depth` if asked for, and passes each with its
-    /// whole photograph to `see`.
+    /// Renders at most `most` training views, evenly spaced, as in `plan`, with depth if `depth`, and passes each with its whole photograph
+    /// to `see`.
     pub(crate) fn show_training_views(
         &mut self,
         most: usize,
@@ -523,7 +526,7 @@ impl Trainer {
         moves.then_some(line).into_iter().chain(by_memory).collect()
     }
 
-    /// The light of each photograph, as learned so far; `None` if none is.
+    /// The light of each photograph, as learned so far; `None` if none has been learned.
     pub fn lights(&self) -> Option<Lights> {
         Lights::of_training(&self.sockets)
     }

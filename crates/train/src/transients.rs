@@ -1,12 +1,12 @@
-//! What stands in one photograph and not in the others: people who walk through, cars, the photographer's shadow.
+//! Transients: what is in one photograph and not in the others, such as people who walk through, cars or the photographer's shadow.
 //!
-//! From time to time all training views are rendered. Where a photograph differs from its frame by a patch of another colour, while
-//! other views that see the same surface agree with theirs, the patch shows something that was only there once, and is hidden from
-//! training from then on. Surfaces that splats have not reached yet differ too, but in all views that see them, and detail averages
-//! out over a block of pixels. And a patch that the other photographs show too is no transient: a veil before the camera hides it in the
-//! frame. Robust losses compare residuals within one photograph (RobustNeRF, Sabour et al. 2023;
-//! SpotLessSplats, Sabour et al. 2024), here they are compared with those of other photographs at the same place: no share of outliers has
-//! to be assumed, and where there are none, nothing is hidden.
+//! From time to time all training views are rendered. Where a photograph differs from its frame by a patch of another colour, while other
+//! photographs of the same surface agree with their frames, the patch shows something that was there only once, and is hidden from training
+//! from then on. Surfaces that splats have not reached yet differ too, but in all views that see them, and detail averages out over a block
+//! of pixels. A patch that the other photographs show too is not a transient: in the frame, a veil of floaters in front of the camera hides
+//! it. Robust losses compare residuals within one photograph (RobustNeRF, Sabour et al. 2023; SpotLessSplats, Sabour et al. 2024), here
+//! they are compared with those of other photographs at the same place: no fraction of outliers has to be assumed, and where there are
+//! none, nothing is hidden.
 
 use crate::photos::Prepared;
 use glam::{Vec2, Vec3};
@@ -17,30 +17,32 @@ use std::collections::BTreeMap;
 
 /// Blocks along the longer side of a photograph.
 const BLOCKS: u32 = 48;
-/// Difference of a block's mean colour, sRGB, from which it may show a transient. With 0.08, soft shadows on the wall of fox count as well.
+/// Minimum difference of a block's mean colour, sRGB, at which it may show a transient. With 0.08, soft shadows on the wall of fox count as
+/// well.
 const LEAST: f32 = 0.2;
-/// Factor over the difference at the same place in other views. A person pasted into 14 of 43 photographs of fox is found whole at 3
-/// or 4, and nothing at all in the photographs without.
+/// Minimum factor over the difference at the same place in other views. A person pasted into 14 of 43 photographs of fox is found whole at
+/// 3 or 4, and nothing is found in the photographs without a person.
 const FACTOR: f32 = 3.0;
-/// The share of the other views that differ less. With the median, unlearned surfaces at the border of the scene count after a fifth of a run; with 0.75
-/// and three witnesses, 25 of 62 photographs of can, whose background is hardly known, lose 12 % each, and held-out PSNR 0.4 dB.
+/// Quantile of the differences in other views that is taken for the difference at a place. With the median, unlearned surfaces at the
+/// border of the scene count after a fifth of a run; with 0.75 and three witnesses, 25 of 62 photographs of can, whose background is hardly
+/// known, lose 12 % of their pixels each, and held-out PSNR falls by 0.4 dB.
 const WITNESS_QUANTILE: f32 = 0.9;
-/// Neighbours of a transient's blocks belong to it from this share of both limits.
+/// Fraction of both limits at which neighbours of a transient's blocks belong to it.
 const GROW: f32 = 0.4;
-/// Other views that must see a block's surface.
+/// Minimum number of other views that see a block's surface.
 const MIN_WITNESSES: usize = 6;
-/// Views asked about each place, the nearest ones.
+/// Maximum number of views consulted about each place, the nearest ones.
 const WITNESSES: usize = 24;
 /// Depths that differ by less than this fraction are those of the same surface.
 const SAME_DEPTH: f32 = 0.15;
-/// Where a frame is empty, it shows what is this far away, in extents of the scene.
+/// Depth assumed where a frame is empty, in extents of the scene.
 const FAR: f32 = 1000.0;
-/// Blocks beyond both limits of a transient; smaller ones are left to the mean of the photographs.
+/// Minimum number of a transient's blocks beyond both limits; smaller transients average out over the photographs.
 const MIN_BLOCKS: usize = 6;
-/// Largest hidden share of a photograph: beyond, it disagrees as a whole.
+/// Maximum hidden fraction of a photograph: beyond it, the photograph disagrees as a whole, and nothing of it is hidden.
 const MOST: f32 = 0.5;
 
-/// A photograph divided into about square blocks. The grid depends on the full size of the photograph only.
+/// A photograph divided into approximately square blocks. The grid depends on the full size of the photograph only.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Grid {
     columns: usize,
@@ -48,7 +50,7 @@ struct Grid {
 }
 
 impl Grid {
-    /// Of photographs with the full-size intrinsics `k`.
+    /// The grid of photographs with the full-size intrinsics `k`.
     fn of(k: &Intrinsics) -> Self {
         let blocks = |side: u32| (BLOCKS * side).div_ceil(k.width.max(k.height)) as usize;
         Self {
@@ -62,12 +64,12 @@ impl Grid {
         self.columns * self.rows
     }
 
-    /// First of the `pixels` of a side in the column or row `block` of `blocks`.
+    /// First pixel of column or row `block` on a side of `pixels` pixels in `blocks` blocks.
     fn start(block: usize, blocks: usize, pixels: usize) -> usize {
         (block * pixels).div_ceil(blocks)
     }
 
-    /// The column or row of `blocks` that contains `pixel` of a side's `pixels`.
+    /// The column or row that contains `pixel` on a side of `pixels` pixels in `blocks` blocks.
     fn block(pixel: usize, blocks: usize, pixels: usize) -> usize {
         pixel * blocks / pixels
     }
@@ -82,19 +84,20 @@ impl Grid {
 
 /// How a training view differs from its photograph, block by block.
 pub(crate) struct Difference {
-    /// Of full size.
+    /// Camera of the photograph at full size.
     camera: Camera,
     grid: Grid,
-    /// Largest difference of the mean colour over the channels, beyond that of the whole photograph; NaN where masked.
+    /// Difference of the mean colour minus that of the whole photograph, the largest over the channels; NaN where masked.
     color: Vec<f32>,
-    /// Mean colour of the photograph, less that difference of the whole; NaN where masked.
+    /// Mean colour of the photograph minus the difference of the whole photograph; NaN where masked.
     photo: Vec<[f32; 3]>,
     /// Depth along +Z, world units; NaN where masked.
     depth: Vec<f32>,
 }
 
 impl Difference {
-    /// Of `frame`, rendered with depth, to `photo`. `camera` is that of the photograph at full size, `extent` that of the scene.
+    /// The difference between `frame`, rendered with depth, and `photo`. `camera` is the photograph's camera at full size, `extent` that of
+    /// the scene.
     pub fn new(frame: &FramePlanes, photo: &Prepared, camera: &Camera, extent: f32) -> Self {
         let (width, height) = (photo.width as usize, photo.height as usize);
         let pixels = width * height;
@@ -128,7 +131,7 @@ impl Difference {
             (mean(color), mean(shown), if count > 0.0 { depth } else { f32::NAN })
         };
         let blocks: Vec<([f32; 3], [f32; 3], f32)> = (0..grid.len()).into_par_iter().map(block).collect();
-        // What the photograph differs by as a whole is its exposure.
+        // The difference of the photograph as a whole is its exposure.
         let whole: [f32; 3] = std::array::from_fn(|c| {
             let mut values: Vec<f32> = blocks.iter().map(|(color, ..)| color[c]).collect();
             quantile(&mut values, 0.5).unwrap_or(0.0)
@@ -164,7 +167,8 @@ impl Difference {
             .world_from_camera(k.ray(Vec2::new(x, y)) * self.depth[i])
     }
 
-    /// The block in which this view sees the surface at `place`; `None` out of view and where it sees something else.
+    /// The block in which this view sees the surface at `place`; `None` if the place is out of view, or the view shows another surface
+    /// there.
     fn sees(&self, place: Vec3) -> Option<usize> {
         let (Vec2 { x, y }, depth) = self.camera.project(place)?;
         let k = &self.camera.intrinsics;
@@ -178,19 +182,19 @@ impl Difference {
     }
 }
 
-/// The value below which a share `q` of the numbers among `values` lies.
+/// The quantile `q` of `values`, without those that are NaN; `None` if there are none.
 fn quantile(values: &mut Vec<f32>, q: f32) -> Option<f32> {
     values.retain(|v| !v.is_nan());
     let at = ((values.len() as f32 * q) as usize).min(values.len().saturating_sub(1));
     (!values.is_empty()).then(|| *values.select_nth_unstable_by(at, f32::total_cmp).1)
 }
 
-/// What is hidden of the training views, by view: whether each block is. Views with nothing hidden are absent.
+/// Whether each block of a training view is hidden from training, by view. Views with nothing hidden are absent.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Hidden(BTreeMap<usize, Vec<bool>>);
 
 impl Hidden {
-    /// What only one of `views` shows. What is hidden already is no witness.
+    /// Finds what only one of `views` shows. Blocks that are hidden `already` are not used as witnesses.
     pub fn find(views: &[(usize, Difference)], extent: f32, already: &Self) -> Self {
         let found = |(view, own): &(usize, Difference)| {
             let mut others: Vec<(f32, usize)> = views
@@ -212,7 +216,7 @@ impl Hidden {
                 if seen.len() < MIN_WITNESSES {
                     return 0.0;
                 }
-                // A veil before this camera differs from what the others show, the photograph behind it does not.
+                // A veil in front of this camera makes its frame differ, but the photograph still looks like the others.
                 let usual = |c: usize| quantile(&mut shown.iter().map(|color| color[c]).collect(), 0.5);
                 let unlike = (0..3).filter_map(|c| Some((own.photo[i][c] - usual(c)?).abs()));
                 let least = LEAST.max(FACTOR * quantile(&mut seen, WITNESS_QUANTILE).unwrap_or(0.0));
@@ -230,7 +234,7 @@ impl Hidden {
         self.0.len()
     }
 
-    /// Mean hidden share of those views.
+    /// Mean hidden fraction of those views.
     pub fn share(&self) -> f64 {
         let share = |blocks: &Vec<bool>| blocks.iter().filter(|hidden| **hidden).count() as f64 / blocks.len() as f64;
         self.0.values().map(share).sum::<f64>() / self.0.len().max(1) as f64
@@ -240,7 +244,7 @@ impl Hidden {
         self.0.get(&view).is_some_and(|blocks| blocks[block])
     }
 
-    /// `photo` of `view` without what is hidden of it; `None` if nothing is. `camera` is that of the view at full size.
+    /// `photo` of `view` with its hidden blocks masked; `None` if there are none. `camera` is that of the view at full size.
     pub fn apply(&self, view: usize, camera: &Camera, photo: &Prepared) -> Option<Prepared> {
         let blocks = self.0.get(&view)?;
         let grid = Grid::of(&camera.intrinsics);
@@ -260,7 +264,7 @@ impl Hidden {
         })
     }
 
-    /// For a checkpoint: view and number of every hidden block.
+    /// For a checkpoint: view number and block number of every hidden block.
     pub fn to_pairs(&self) -> Vec<u64> {
         let blocks = |(view, blocks): (&usize, &Vec<bool>)| {
             let hidden = blocks.iter().enumerate().filter(|(_, hidden)| **hidden);
@@ -286,7 +290,8 @@ impl Hidden {
     }
 }
 
-/// Patches of connected blocks with an `excess` of at least [`GROW`], [`MIN_BLOCKS`] or more of them above 1, and the blocks around them.
+/// Marks patches of connected blocks with an `excess` of at least [`GROW`], of which at least [`MIN_BLOCKS`] have one of at least 1, and
+/// the blocks around them.
 fn patches(grid: Grid, excess: &[f32]) -> Vec<bool> {
     let mut is_hidden = vec![false; excess.len()];
     let mut is_visited = vec![false; excess.len()];
@@ -322,7 +327,7 @@ mod tests {
     use super::*;
     use irradia_scene::Pose;
 
-    /// Photographs of a grey wall from `count` places side by side, 96 x 48 pixels, and their empty differences.
+    /// Photographs of a grey wall from `count` places side by side, 96 x 48 pixels, and their differences, which are 0.
     fn wall(count: usize) -> Vec<(usize, Difference)> {
         let difference = |view: usize| {
             let pose = Pose::look_at(
@@ -336,7 +341,7 @@ mod tests {
         (0..count).map(difference).collect()
     }
 
-    /// The difference of a grey frame 4 units away to a photograph of grey values.
+    /// The difference between a grey frame 4 units away and a photograph of grey values.
     fn of_frame(camera: &Camera, value: impl Fn(usize, usize) -> f32) -> Difference {
         let photo = photo(value);
         let pixels = photo.rgb.len() / 3;
@@ -383,7 +388,7 @@ mod tests {
         let mask = shown.mask.unwrap();
         for (i, value) in mask.iter().enumerate() {
             let (x, y) = (i % 96, i / 96);
-            // A block has two pixels; one block around belongs to the patch.
+            // A block is two pixels wide; the blocks around a patch belong to it.
             let is_near = (38..62).contains(&x) && (8..42).contains(&y);
             assert_eq!(*value == 0, is_near, "({x}, {y})");
         }
@@ -421,7 +426,7 @@ mod tests {
         let camera = views[3].1.camera;
         views[3].1 = of_frame(&camera, |_, _| 0.2);
         assert_eq!(Hidden::find(&views, 1.0, &Hidden::default()), Hidden::default());
-        // Five witnesses are too few, and so are those that see another surface.
+        // Five witnesses are too few, and views that see another surface are not witnesses.
         views[3].1 = of_frame(&camera, person);
         assert_eq!(Hidden::find(&views[0..6], 1.0, &Hidden::default()), Hidden::default());
         views[3].1.depth.fill(2.0);

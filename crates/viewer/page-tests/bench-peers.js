@@ -1,5 +1,5 @@
-// Measures a frame of the browser's own drawing beside Spark's and PlayCanvas' (the engine of SuperSplat's viewer), the same file, the
-// same cameras, the same browser: npm run bench-peers -- [splats]. What is compared with is not a dependency:
+// Measures a frame drawn by the page beside one drawn by Spark and by PlayCanvas (the engine of SuperSplat's viewer), with the same file,
+// cameras and browser: npm run bench-peers -- [splats]. The peers are not dependencies:
 // npm install --no-save @sparkjsdev/spark@2.2.0 three@0.187.0 playcanvas@2.23.3
 
 import { createReadStream, existsSync, statSync } from "node:fs";
@@ -43,7 +43,7 @@ globalThis.frame = async (angle) => {
   renderer.render(scene, camera);
   gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
   const spent = performance.now() - started;
-  // Sorting goes on in a worker.
+  // Sorting continues in a worker.
   await new Promise((resolve) => setTimeout(resolve, 400));
   return spent;
 };
@@ -116,6 +116,8 @@ async function ours() {
   const server = await serve("view", file, "--port", "0");
   const { page } = await open(browser, server.address, { width: 1000, height: 700 });
   await set(page, { drawing: "local" });
+  // The peers draw with WebGL2.
+  await page.waitForFunction(() => document.querySelector("irr-stage").local.holdWebGl(true) !== null);
   await page.waitForFunction(() => {
     const { local } = document.querySelector("irr-stage");
     return local.total > 0 && local.loaded === local.total && local.sharp;
@@ -129,13 +131,13 @@ async function ours() {
     for (const angle of angles) {
       // Camera axes: x right, y down, z forward, around the y axis.
       const camera = { position: [distance * Math.sin(angle), 0, distance * Math.cos(angle)], rotation: [0, Math.cos(angle / 2), 0, -Math.sin(angle / 2)] };
-      // Not through the page's own loop, which draws at a size of its own.
+      // Not through the page's own loop, which chooses its own size.
       local.draw = () => false;
       local.want(camera, k, shot);
       while (local.busy) await new Promise((resolve) => setTimeout(resolve, 5));
       const started = performance.now();
-      local.paint(1);
-      local.gl.readPixels(0, 0, 1, 1, local.gl.RGBA, local.gl.UNSIGNED_BYTE, new Uint8Array(4));
+      // Measured: it reads a pixel back, which waits for the picture.
+      local.webGl.paint(camera, k, local.options(shot, true));
       times.push(performance.now() - started);
       await new Promise((resolve) => setTimeout(resolve, 400));
     }

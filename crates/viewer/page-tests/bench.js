@@ -1,5 +1,5 @@
-// Measures the viewer: npm run bench [-- served|local|train ..]. Figures are those of this machine and of what else it does; compare
-// within one run.
+// Measures the viewer: npm run bench [-- served|local|train ..]. Figures depend on this machine and its other load; compare within
+// one run.
 
 import { existsSync, readFileSync } from "node:fs";
 import { join } from "node:path";
@@ -7,7 +7,7 @@ import { browse, open, scratch, serve, set } from "./tests/harness.js";
 import { random } from "./tests/scenes.js";
 
 const SPLATS = 500_000;
-/** Seconds of a window of a training, and how often each kind comes. */
+/** Seconds of a window of a training, and number of windows of each kind. */
 const WINDOW = 8;
 const ROUNDS = 4;
 const wanted = process.argv.slice(2);
@@ -20,7 +20,7 @@ const cpu = (pid) => {
 };
 const percentile = (values, share) => [...values].sort((a, b) => a - b)[Math.min(values.length - 1, Math.floor(values.length * share))];
 
-/** Turns the camera for some seconds; frames a second, and delays. */
+/** Turns the camera for some seconds; returns pictures per second, and delays. */
 const turn = (page, seconds) => page.evaluate(async (seconds) => {
   const stage = document.querySelector("irr-stage");
   stage.delays.length = 0;
@@ -42,7 +42,7 @@ const turn = (page, seconds) => page.evaluate(async (seconds) => {
   return { fps: pictures / seconds, delays: stage.delays, size: stage.drawsLocally ? stage.local.canvas.width : stage.served.width };
 }, seconds);
 
-// The served picture is measured as a browser without a GPU shows it; WebGL needs the software rasteriser.
+// The served picture is measured in a browser without a GPU; WebGL needs the software rasteriser.
 const browser = await browse();
 const drawing = wants("local") ? await browse("webgl") : null;
 
@@ -109,7 +109,7 @@ if (wants("train")) {
   const data = join(import.meta.dirname, "../../../../shared/data/fox_colmap");
   if (!existsSync(data)) console.log("SKIPPED (no ../shared): training with pages");
   else {
-    // One run, its windows in turn, so that neither the growth of the scene nor the opening of the page counts.
+    // One run with windows of each kind in turn, so that neither the growth of the scene nor opening the page counts.
     const out = join(scratch, "watched");
     const server = await serve("train", data, "--out", out, "--steps", "100000", "--downscale", "2", "--holdout", "0", "--view", "--port", "0");
     const steps = () => Number(/.*"step":(\d+)/s.exec(readFileSync(join(out, "events.jsonl"), "utf8").slice(-4000))?.[1] ?? 0);

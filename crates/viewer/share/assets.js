@@ -1,4 +1,4 @@
-// Where the renderer's shaders, worker and splats come from in a shared page: the page itself, or the file beside it.
+// Loads the renderer's shaders, worker and splats in a shared page: from the page itself, or from the file beside it.
 
 /** @param {string} id */
 const text = (id) => /** @type {HTMLElement} */ (document.getElementById(id)).textContent ?? "";
@@ -28,14 +28,14 @@ async function fetched(file, signal) {
     if (error.name === "AbortError") throw error;
     return null;
   });
-  if (!response?.ok) throw new Error(`${file} cannot be loaded: serve this folder, with all its files, by a web server, or share the scene as one page`);
+  if (!response?.ok) throw new Error(`${file} cannot be loaded: serve this folder, with all its files, from a web server, or share the scene as one page`);
   const bytes = await response.blob();
   const start = new Uint8Array(await bytes.slice(0, 2).arrayBuffer());
-  // Some servers say how it is packed, and the browser has unpacked it.
+  // If the server declares the compression, the browser has already unpacked the file.
   return start[0] === 0x1f && start[1] === 0x8b ? unzipped(bytes.stream()) : new Response(bytes.stream());
 }
 
-/** What the page holds in base64. @param {string} id */
+/** The bytes that the page holds in base64. @param {string} id */
 function inside(id) {
   return new Blob(decoded(text(id))).stream();
 }
@@ -45,7 +45,7 @@ function unzipped(packed) {
   return new Response(packed.pipeThrough(new DecompressionStream("gzip")));
 }
 
-/** The bytes of base64, part by part. @param {string} base64 */
+/** The bytes of base64 text, decoded part by part. @param {string} base64 */
 function decoded(base64) {
   const part = 4 << 20;
   const parts = [];

@@ -20,12 +20,12 @@ let stale = true;
 const renderer = new LocalRenderer(stage, () => (stale = true), (problem) => (message.textContent = problem));
 renderer.load({ version: 1, background: view.background, antialias: view.antialias });
 renderer.ready.then(() => {
-  if (!renderer.works) message.textContent = "This browser draws neither with WebGPU nor with WebGL2.";
+  if (!renderer.works) message.textContent = "This browser supports neither WebGPU nor WebGL2.";
 });
-// For tests, and for pages that hold this one.
+// For tests, and for pages that embed this one.
 Object.assign(window, { irradia: { renderer, camera: () => camera, set: (to) => ((camera = to), (stale = true)) } });
 
-/** Pixels and focal length: the picture is at least as wide and as high as at the start. */
+/** Pixels and focal length: the picture shows at least as much in width and height as at the start. */
 function intrinsics() {
   const density = Math.min(devicePixelRatio || 1, DENSITY);
   const [width, height] = [Math.max(1, Math.round(stage.clientWidth * density)), Math.max(1, Math.round(stage.clientHeight * density))];
@@ -59,7 +59,7 @@ function pan(dx, dy) {
   stale = true;
 }
 
-/** Comes nearer to the pivot. @param {number} amount in powers of e */
+/** Moves nearer to the pivot. @param {number} amount in powers of e */
 function dolly(amount) {
   const offset = subtract(camera.position, pivot);
   camera = { ...camera, position: add(pivot, scale(offset, Math.exp(-amount))) };
@@ -87,7 +87,7 @@ function along(seconds) {
 /** Begins or ends the flight. @param {number | null} now */
 function fly(now) {
   if (began !== null && now === null) {
-    // The camera stays where it is, and turns about what is before it.
+    // The camera stays where it is, and turns about a point in front of it.
     const ahead = axes(camera.rotation)[2];
     const distance = Math.max(dot(subtract(view.pivot, camera.position), ahead), 0.1 * view.radius);
     pivot = add(camera.position, scale(ahead, distance));
@@ -100,9 +100,9 @@ if (view.path) {
   play.hidden = false;
   play.addEventListener("click", () => fly(began === null ? performance.now() : null));
 }
-/** Whether the flight is still to begin by itself. */
+/** Whether the flight will begin by itself. */
 let opens = view.path && !matchMedia("(prefers-reduced-motion: reduce)").matches;
-/** Ends the flight, since the page is used. */
+/** Ends the flight when the page is used. */
 function touch() {
   opens = false;
   fly(null);

@@ -1,4 +1,4 @@
-//! The socket of one page: its requests to the desk, pictures and news to the page.
+//! The socket of one page: takes its requests to the desk, and sends it pictures and news.
 
 use crate::Subject;
 use crate::desk::{Out, SEATS, Task};
@@ -14,13 +14,13 @@ use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, watch};
 use tokio::time::{MissedTickBehavior, interval, timeout};
 
-/// Messages that wait for a page.
+/// Maximum number of messages that wait for a page.
 const OUTBOX: usize = 8;
-/// Requests a second; a page that moves sends one per frame of its screen.
+/// Maximum number of requests per second; a page with a moving camera sends one per frame of its screen.
 const RATE: f32 = 500.0;
-/// Requests beyond the rate, or that cannot be read, before a page is sent away.
+/// Number of requests beyond the rate or unreadable after which a page is disconnected.
 const PATIENCE: u32 = 200;
-/// Time to take a message.
+/// Time in which a page must accept a message.
 const TAKES: Duration = Duration::from_secs(20);
 /// Interval of news about a training.
 const NEWS: Duration = Duration::from_millis(250);
@@ -46,7 +46,7 @@ pub(crate) async fn serve(mut socket: WebSocket, shared: Arc<Shared>) {
     let Some(seat) = shared.desk.sit(outbox) else {
         shared.notices.once(
             "seats",
-            format_args!("more than {SEATS} pages: further ones are sent away"),
+            format_args!("more than {SEATS} pages: further ones are rejected"),
         );
         let reason = CloseFrame {
             code: 1013,
@@ -78,7 +78,7 @@ pub(crate) async fn serve(mut socket: WebSocket, shared: Arc<Shared>) {
                     Handled::Fine => {}
                     Handled::Left => return,
                     Handled::SentAway(why) => {
-                        shared.notices.once(why, format_args!("a page was sent away: {why}"));
+                        shared.notices.once(why, format_args!("a page was disconnected: {why}"));
                         let reason = CloseFrame { code: 1008, reason: why.into() };
                         send(&mut socket, Message::Close(Some(reason))).await;
                         return;
@@ -127,7 +127,7 @@ pub(crate) async fn serve(mut socket: WebSocket, shared: Arc<Shared>) {
     }
 }
 
-/// What is told of editing, when it changes; never if there is nothing to edit.
+/// Waits for the next state of the editing session; for ever if there is none.
 async fn changed(edits: &mut Option<watch::Receiver<Arc<Value>>>) -> Option<Arc<Value>> {
     if let Some(edits) = edits
         && edits.changed().await.is_ok()
@@ -137,7 +137,7 @@ async fn changed(edits: &mut Option<watch::Receiver<Arc<Value>>>) -> Option<Arc<
     std::future::pending().await
 }
 
-/// The scene, if its splats are others than those of `version`, which is updated.
+/// The scene, if its splats are not those of `version`, which is updated.
 fn fresh_scene(shared: &Shared, version: &mut u64) -> Option<Value> {
     let edition = shared.subject.edition()?;
     if edition.splats_version == *version {
@@ -147,7 +147,7 @@ fn fresh_scene(shared: &Shared, version: &mut u64) -> Option<Value> {
     Some(scene(&edition))
 }
 
-/// Whether the page took `message` in time.
+/// Sends `message`; returns whether the page accepted it in time.
 async fn send(socket: &mut WebSocket, message: Message) -> bool {
     matches!(timeout(TAKES, socket.send(message)).await, Ok(Ok(())))
 }
@@ -158,7 +158,7 @@ enum Handled {
     SentAway(&'static str),
 }
 
-/// Counts requests against a rate, and faults against a patience.
+/// Limits the rate of requests and the number of faults.
 struct Allowance {
     left: f32,
     at: Instant,
@@ -174,7 +174,7 @@ impl Allowance {
         }
     }
 
-    /// Whether one more request is within the rate.
+    /// Counts a request; returns whether it is within the rate.
     fn take(&mut self) -> bool {
         let now = Instant::now();
         self.left = (self.left + RATE * now.duration_since(self.at).as_secs_f32()).min(RATE);
@@ -230,7 +230,7 @@ fn handle(shared: &Shared, seat: u64, message: Message, allowance: &mut Allowanc
                 Ok(editing) => match request.check() {
                     Err(error) => Some(error.to_string()),
                     Ok(()) if editing.ask(seat, request) => None,
-                    Ok(()) => Some("too many edits wait: wait for the last ones".to_owned()),
+                    Ok(()) => Some("too many edits are waiting: try again when they are done".to_owned()),
                 },
             };
             if let Some(why) = refused {
@@ -243,7 +243,7 @@ fn handle(shared: &Shared, seat: u64, message: Message, allowance: &mut Allowanc
             let told = match kept {
                 Some(Ok(())) => json!({ "tell": "unit", "metres": metres }),
                 Some(Err(error)) => json!({ "tell": "problem", "text": error.to_string() }),
-                None => json!({ "tell": "problem", "text": "only a run keeps its scale" }),
+                None => json!({ "tell": "problem", "text": "the scale can only be saved in the folder of a run" }),
             };
             desk.tell(seat, told.to_string());
         }
@@ -251,12 +251,12 @@ fn handle(shared: &Shared, seat: u64, message: Message, allowance: &mut Allowanc
     Handled::Fine
 }
 
-/// By how much edits have scaled the whole scene: the unit of its run is that before.
+/// The factor by which edits have scaled the whole scene: the unit saved in the run is that before the edits.
 fn scale_of(subject: &Subject) -> f64 {
     subject.edition().map_or(1.0, |edition| edition.placement.scale)
 }
 
-/// What a page is told first.
+/// The first message to a page.
 fn hello(shared: &Shared) -> Value {
     let subject = &shared.subject;
     let edition = subject.edition();
@@ -278,7 +278,7 @@ fn hello(shared: &Shared) -> Value {
     })
 }
 
-/// A version of the scene.
+/// The message that describes a version of the scene.
 fn scene(edition: &Edition) -> Value {
     let scene = edition.scene();
     let outlook = scene.outlook();

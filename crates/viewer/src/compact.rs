@@ -1,4 +1,4 @@
-//! Splats as they travel to a browser that draws them itself: most important first, so that a picture stands early.
+//! The format of splats for browsers that draw them: most important first, so that there is a picture early.
 //!
 //! Little endian. A header of 32 bytes: `IRS1`, number of splats, SH degree, splats per block, numbers of splats of up to three levels
 //! of detail, a word of zero; then the blocks of the scene, and those of each level.
@@ -37,7 +37,7 @@ pub(crate) fn compact(splats: &Splats, degree: u32, most: usize) -> Vec<u8> {
     compact_in_order(splats, degree, &order, &[])
 }
 
-/// The splats `order` in compact form, with bands up to `degree`, and behind them `levels` of the same degree, most important first.
+/// The splats `order` in compact form, with bands up to `degree`, and after them `levels` of the same degree, most important first.
 pub(crate) fn compact_in_order(splats: &Splats, degree: u32, order: &[u32], levels: &[Splats]) -> Vec<u8> {
     let degree = degree.min(splats.sh_degree());
     let mut parts = vec![(splats, Cow::Borrowed(order))];
@@ -113,7 +113,7 @@ fn packed_rotation(q: [f32; 4]) -> u64 {
     let sign = if q[largest] < 0.0 { -1.0 } else { 1.0 } / length.max(1e-20);
     let others = (0..4).filter(|c| *c != largest);
     others.fold((largest as u64) << 45, |bits, c| {
-        // The place of the component follows from how many are left.
+        // The position of the component in the bits follows from the number of components after it.
         let value = (q[c] * sign * std::f32::consts::SQRT_2).clamp(-1.0, 1.0);
         let place = 15 * ((0..4).filter(|d| *d != largest && *d > c).count());
         bits | ((((value * 0.5 + 0.5) * 32767.0).round() as u64) << place)

@@ -1,6 +1,6 @@
-//! Who wants which picture. A page takes a seat, names the picture it wants, and gets it when it is drawn; a newer wish replaces
-//! an older one. At most [`IN_FLIGHT`] pictures travel to a page that has not shown them, so that a slow page gets fewer
-//! pictures, and its own only.
+//! The pictures that pages request. A page takes a seat, requests a picture, and gets it when it is drawn; a newer request replaces
+//! an older one. At most [`IN_FLIGHT`] pictures are on the way to a page that has not shown them, so that a slow page gets fewer
+//! pictures and does not slow down others.
 
 use crate::message::{RawShot, Shot};
 use crate::pace::{Detail, Pace};
@@ -9,19 +9,19 @@ use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
 
-/// Pages at once.
+/// Maximum number of pages.
 pub(crate) const SEATS: usize = 8;
-/// Pictures on the way to a page.
+/// Maximum number of pictures on the way to a page.
 const IN_FLIGHT: usize = 2;
 /// A camera without a new position for this long is at rest.
 const REST: Duration = Duration::from_millis(100);
-/// Wishes other than pictures that wait.
+/// Maximum number of waiting requests other than pictures.
 const JOBS: usize = 4;
-/// Time given to an outbox that is nearly full before it is checked again: nobody says when a page has taken a message.
+/// Time until an outbox that is nearly full is checked again: nothing signals that a page has taken a message.
 const DRAINS: Duration = Duration::from_millis(20);
-/// Between two copies of a training's scene passes this many times what a copy and its picture take.
+/// Time between two copies of a training's scene, as a multiple of the time that a copy and its picture take.
 const AT_REST: u32 = 40;
-/// Least time between two copies of a training's scene.
+/// Minimum time between two copies of a training's scene.
 const COPIES: Duration = Duration::from_millis(1000);
 
 /// A message to a page.
@@ -30,7 +30,7 @@ pub(crate) enum Out {
     Binary(Vec<u8>),
 }
 
-/// A thing to draw or to find out for a page.
+/// Work to do for a page.
 pub(crate) enum Task {
     Picture { shot: Shot, detail: Detail },
     Pick { x: f32, y: f32, tag: String, shot: RawShot },
@@ -44,7 +44,7 @@ struct Drawn {
 }
 
 impl Drawn {
-    /// The share of pixels, if all splats were drawn.
+    /// The share of the pixels that was drawn, if all splats were.
     fn share(&self) -> Option<f32> {
         (self.detail.splats == 1.0).then_some(self.detail.pixels)
     }
@@ -65,16 +65,16 @@ struct Seat {
 #[derive(Default)]
 struct State {
     seats: BTreeMap<u64, Seat>,
-    /// Seats taken so far.
+    /// Number of seats taken so far, those left again included.
     taken: u64,
     /// The seat served last.
     served: u64,
     closing: bool,
-    /// Changes outside so far.
+    /// Number of calls of [`Desk::wake`] so far.
     wakes: u64,
-    /// Nothing is drawn before this, for the sake of a training.
+    /// Nothing is drawn before this time, so that a training gets the processor.
     rest_until: Option<Instant>,
-    /// No picture is renewed for a newer scene before this.
+    /// No picture is renewed for a newer scene before this time.
     renew_after: Option<Instant>,
 }
 
@@ -125,7 +125,7 @@ impl Desk {
         self.changed.notify_all();
     }
 
-    /// Seats taken.
+    /// Number of seats taken now.
     pub fn len(&self) -> usize {
         self.lock().seats.len()
     }
@@ -140,7 +140,7 @@ impl Desk {
     /// The page wants this picture, or none.
     pub fn want(&self, seat: u64, shot: Option<Shot>) {
         self.with_seat(seat, |seat| {
-            // The same camera again, after a reconnection for example, is no motion.
+            // Every request counts as a motion of the camera: it is at rest [`REST`] after the last one.
             (seat.shot, seat.shot_at) = (shot, Instant::now());
         });
     }
@@ -154,7 +154,7 @@ impl Desk {
         });
     }
 
-    /// Adds a wish other than a picture; the oldest is dropped if too many wait.
+    /// Adds a request other than a picture; the oldest is dropped if too many wait.
     pub fn ask(&self, seat: u64, task: Task) {
         self.with_seat(seat, |seat| {
             if seat.jobs.len() >= JOBS {
@@ -169,9 +169,9 @@ impl Desk {
         self.with_seat(seat, |seat| seat.scores = (views > 0).then_some((0, views)));
     }
 
-    /// Something outside has changed: the scene, or the training's state.
+    /// Wakes [`Self::next`] after a change of the scene or of the training's state.
     pub fn wake(&self) {
-        // With the lock, so that no sleeper misses it; counted for one that is about to sleep.
+        // Under the lock, so that no sleeping thread misses it; counted for a thread that is about to sleep.
         self.lock().wakes += 1;
         self.changed.notify_all();
     }
@@ -188,14 +188,14 @@ impl Desk {
         !state.closing && newest.is_some_and(|newest| newest.id == shot.id)
     }
 
-    /// Waits for the next task, seats in turn; `None` when closing. `now` is asked again at every wake-up.
+    /// Waits for the next task, seats in turn; `None` when closing. `now` is called again at every wake-up.
     pub fn next(&self, now: impl Fn() -> Now) -> Option<(u64, Task)> {
         let mut state = self.lock();
         loop {
             if state.closing {
                 return None;
             }
-            // Not under the lock of the desk: `now` takes others.
+            // Not under the lock of the desk: `now` takes other locks.
             let wakes = state.wakes;
             drop(state);
             let at = now();
@@ -254,7 +254,7 @@ impl Desk {
                 version,
                 detail,
             });
-            // The outbox has more room than pictures may be in flight: a full one belongs to a page that is being closed.
+            // The outbox has room for more than the pictures in flight: a full one belongs to a page that is being closed.
             if seat.outbox.try_send(Out::Binary(bytes)).is_ok() {
                 seat.in_flight.push_back(shot.id);
             }
@@ -266,13 +266,13 @@ impl Desk {
         self.with_seat(seat, |seat| drop(seat.outbox.try_send(Out::Text(text))));
     }
 
-    /// Leaves time to a training after `seconds` of drawing a moving camera, of which the browser's share is about as much.
+    /// Leaves time to a training after drawing for a moving camera took `seconds`; the browser needs about as much again.
     pub fn rest(&self, seconds: f32) {
         self.lock().rest_until = Some(Instant::now() + Duration::from_secs_f32(4.5 * seconds));
     }
 
-    /// When the next copy of a training's scene is due, after a picture of the present one that took `seconds` and a copy that took
-    /// `copying`; never while nobody looks.
+    /// When the next copy of a training's scene is due, after a picture of the current one that took `seconds` and a copy that took
+    /// `copying`; `None` while no page is open.
     pub fn renewal(&self, seconds: f32, copying: f32) -> Option<Instant> {
         let mut state = self.lock();
         if state.seats.is_empty() {
@@ -303,7 +303,7 @@ impl Seat {
         let Some((view, count)) = self.scores else {
             return picture;
         };
-        // A camera at rest leaves time for measurements, and they leave room in the outbox for pictures.
+        // Views are measured only while the camera is at rest, and only while the outbox has room for pictures besides.
         let rests_at = self.shot_at + REST;
         let free_at = if self.outbox.capacity() > 2 {
             clock
@@ -335,7 +335,7 @@ impl Seat {
         match same {
             None => picture(self.pace.moving(&shot, now.training)),
             Some(drawn) if drawn.version != now.version => match renew_after.filter(|after| *after > clock) {
-                // The camera has just stopped: it becomes sharp first.
+                // The camera has just stopped: its picture becomes sharp first.
                 _ if !drawn.detail.sharp && rests_at <= clock => resting(None),
                 Some(after) => Next::At(after.min(rests_at.max(clock))),
                 None => resting(drawn.share()),
@@ -456,7 +456,7 @@ mod tests {
         assert_eq!(drawn.id, 3);
         deliver(&desk, seat, &drawn, detail);
         desk.shown(seat, 2);
-        // Nothing newer: the next one, after a moment, is the sharp one of the same wish.
+        // Without a newer request, the next picture, after a moment, is the sharp one of the same request.
         let (_, drawn, resting) = next(&desk);
         assert!(drawn.id == 3 && !resting.moving && resting.sharp);
         assert!(inbox.try_recv().is_ok() && inbox.try_recv().is_ok() && inbox.try_recv().is_err());

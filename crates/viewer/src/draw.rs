@@ -1,4 +1,4 @@
-//! The thread that draws: takes one task after the other from the desk.
+//! The drawing thread: takes one task after another from the desk.
 
 use crate::desk::{Desk, Now, Task};
 use crate::message::{PictureHeader, Shot, picture};
@@ -11,15 +11,15 @@ use std::time::Instant;
 
 /// JPEG quality of a moving camera's pictures.
 const MOVING_QUALITY: u8 = 75;
-/// JPEG quality of a camera at rest: the loss is below what 8 bits show.
+/// JPEG quality for a camera at rest: the loss is below what 8 bits show.
 const SHARP_QUALITY: u8 = 96;
-/// Bytes of splats copied per second, for the time that a training loses by it.
+/// Bytes of splats copied per second, to estimate the time that a training loses by a copy.
 const COPY_RATE: f32 = 1.5e9;
 
 /// Draws until the desk closes.
 pub(crate) fn draw(subject: &Subject, desk: &Desk) {
     let mut painter = Painter::default();
-    // The version whose successor has been asked for.
+    // The version whose successor has been requested.
     let mut renewed = 0;
     let now = || Now {
         version: subject.edition().map_or(0, |edition| edition.version),
@@ -60,11 +60,11 @@ fn draw_picture(
 ) {
     let opened = Instant::now();
     painter.prepare(edition, shot, &detail);
-    // What is done once a version does not tell what pictures cost.
+    // Work that is done once per version is not part of a picture's cost.
     let started = Instant::now();
     let k = shot.camera.intrinsics.scaled(detail.pixels.sqrt());
     let view = shot.view.and_then(|view| subject.views.0.get(view));
-    // Its photograph may be missing: then there is no picture of errors.
+    // Its photograph may be missing: then colours are drawn instead of errors.
     let shot_drawn = match view.is_some_and(|view| view.photo.is_some()) {
         true => *shot,
         false => Shot {

@@ -12,7 +12,7 @@ pub enum ViewerError {
     #[error(transparent)]
     Format(#[from] irradia_runs::formats::FormatError),
     /// A run has not written a scene yet.
-    #[error("{0} holds no scene yet: wait for its end, or resume it with irradia train --resume {0} --view", path.display())]
+    #[error("{0} has no scene yet: wait until the run ends, or resume it with irradia train --resume {0} --view", path.display())]
     Unfinished {
         /// The folder.
         path: PathBuf,
@@ -25,10 +25,10 @@ pub enum ViewerError {
         /// The system's reason.
         source: io::Error,
     },
-    /// A scene without splats was to be shared.
-    #[error("a radiance field has no splats, which a shared page draws; train splats, or share a film of it")]
+    /// The scene to share is a radiance field, without splats.
+    #[error("a shared page draws splats, and a radiance field has none; train splats, or share a film of it")]
     NoSplats,
-    /// A scene of which nothing is left was to be shared.
+    /// The scene to share is empty.
     #[error("the scene has no splats: there is nothing to show")]
     Empty,
     /// No scene fits into a limit of bytes.

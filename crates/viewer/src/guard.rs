@@ -1,18 +1,18 @@
-//! Who may talk to the server: only the page that it served, and beyond this machine only who knows the token.
+//! Access control of the server: only the page that it served has access, and from other machines only with the token.
 //!
-//! - `Host` must be an address, `localhost` or the host that was asked for: a name that an attacker points at this machine (DNS
+//! - `Host` must be an address, `localhost` or the host given by `--host`: a name that an attacker points at this machine (DNS
 //!   rebinding) is refused.
-//! - `Origin`, where a browser sends it, must be this server: no page of another site can open the socket. Fetches of another
-//!   site that carry no origin, such as images, are known by `Sec-Fetch-Site`.
-//! - Beyond loopback every request needs the token: in the address at first, from then on in a cookie.
+//! - `Origin`, if a browser sends it, must be this server: no page of another site can open the socket. Requests from another
+//!   site without an origin, such as those for images, are recognised by `Sec-Fetch-Site`.
+//! - Beyond loopback every request needs the token: first in the address, then in a cookie.
 
 use axum::http::header::{COOKIE, HOST, ORIGIN};
 use axum::http::{HeaderMap, Method, Uri};
 use std::net::IpAddr;
 
-/// Name of the cookie, and of the parameter of the address.
+/// Name of the cookie, and of the parameter in the address.
 pub const TOKEN: &str = "token";
-/// Where pages send scenes to.
+/// Path to which pages send scenes.
 pub const UPLOADS: &str = "/merge/";
 
 /// Why a request is refused.
@@ -25,10 +25,10 @@ pub(crate) enum Refusal {
 }
 
 impl Refusal {
-    /// In words, for the log and the answer.
+    /// The reason in words, for the log and the response.
     pub fn reason(self) -> &'static str {
         match self {
-            Self::Method => "only GET is answered, and scenes to merge",
+            Self::Method => "only GET requests and scenes to merge are accepted",
             Self::Host => "the Host of the request is not this server",
             Self::Origin => "the request comes from a page of another site",
             Self::Token => "the address lacks the token: use the one that was printed",
@@ -36,16 +36,16 @@ impl Refusal {
     }
 }
 
-/// How a request was let in.
+/// How a request was admitted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Entry {
     Plain,
-    /// With the token in its address: the answer sets the cookie.
+    /// With the token in its address: the response sets the cookie.
     ByAddress,
 }
 
 pub(crate) struct Guard {
-    /// The host asked for with `--host`.
+    /// The host given by `--host`.
     pub host: String,
     /// `None` on loopback.
     pub token: Option<String>,
@@ -65,11 +65,11 @@ impl Guard {
         }
         match headers.get(ORIGIN) {
             Some(origin) if origin.as_bytes() != format!("http://{host}").as_bytes() => return Err(Refusal::Origin),
-            // Every browser says who sends.
+            // Every browser sends the origin of a POST request.
             None if sends => return Err(Refusal::Origin),
             _ => {}
         }
-        // A link on another site may lead to the page; nothing else of it may be used there.
+        // A link on another site may lead to the page; other sites may use nothing else.
         let foreign = matches!(text("sec-fetch-site"), Some("cross-site" | "same-site"));
         if foreign && !(uri.path() == "/" && text("sec-fetch-mode") == Some("navigate")) {
             return Err(Refusal::Origin);
@@ -112,7 +112,7 @@ impl Guard {
     }
 }
 
-/// Compares in a time that does not tell how much is right.
+/// Compares in a time that does not depend on how many bytes are equal.
 fn same(a: &str, b: &str) -> bool {
     a.len() == b.len()
         && a.bytes()

@@ -1,4 +1,4 @@
-//! Which splats matter most, where not all of them can be drawn at once.
+//! The order of splats by importance, for when not all of them can be drawn at once.
 
 use irradia_splat::Splats;
 use irradia_splat::render::ALPHA_MIN;

@@ -4,8 +4,8 @@ use irradia_splat::shaders::of_a_frame;
 use serde_json::json;
 use std::sync::LazyLock;
 
-/// `{"parts": [text, ..], "kernels": {name: [number of part, ..], ..}}`: a kernel is its parts one after another; what several share
-/// is there once.
+/// `{"parts": [text, ..], "kernels": {name: [number of part, ..], ..}}`: a kernel is the concatenation of its parts; a part that
+/// several kernels share is stored once.
 pub(crate) fn kernels() -> &'static str {
     static TEXT: LazyLock<String> = LazyLock::new(|| {
         let mut parts: Vec<&str> = Vec::new();
@@ -32,7 +32,7 @@ mod tests {
     use super::*;
     use crate::page::file;
 
-    /// Arrays that the page binds to a kernel: the elements of the list behind `.name, ` or `(name, `.
+    /// Number of arrays that the page binds to a kernel: the elements of the list behind `.name, ` or `(name, `.
     fn bound(name: &str) -> usize {
         let scripts = ["device", "frame", "sort", "webgpu"].map(|script| {
             let (_, text) = file(&format!("js/local/{script}.js")).expect("a module of the page");

@@ -1,20 +1,20 @@
-//! Which level of detail of a scene is drawn while the camera moves; at rest it is the scene itself.
+//! Selects the level of detail that is drawn while the camera moves; at rest the scene itself is drawn.
 
 use glam::Vec2;
 use irradia_scene::Camera;
 use irradia_splat::Splats;
 use std::sync::Arc;
 
-/// Splats for each pixel that the scene covers which a level has at least, if it is drawn for its distance alone. Pictures of such levels of
-/// fox and fern are closer to the picture at full size, shrunk, than those of all splats, which are widened to a pixel each, or at most 0.6 dB
-/// farther from it. `levels.js` has the same.
+/// Minimum number of splats per covered pixel of a level that is drawn because of its distance alone. Pictures of such levels of fox and
+/// fern are closer to the picture at full size, shrunk, than those of all splats, which are widened to a pixel each, or at most 0.6 dB
+/// farther from it. `levels.js` has the same value.
 const DENSE: f32 = 2.0;
-/// Positions by which it is estimated what a camera sees.
+/// Number of positions used to estimate what a camera sees.
 const SAMPLE: usize = 4096;
-/// Share of what a camera sees that may lie on either side of what counts as covered.
+/// Share of the splats in view that is left out on either side when the covered area is measured.
 const OUTSIDE: f32 = 0.05;
 
-/// Levels of detail, each of about half of the splats of the one before, the first of half of the scene's.
+/// Levels of detail, each with about half the splats of the one before, the first with half of the scene's.
 #[derive(Clone, Default)]
 pub(crate) struct Levels {
     levels: Arc<[Splats]>,
@@ -35,8 +35,8 @@ impl Levels {
         self.levels.get(number.checked_sub(1)?)
     }
 
-    /// The number of the level to draw for a moving camera: the coarsest that has [`DENSE`] splats a pixel, and coarser where only the
-    /// part `affordable` of the scene's splats can be drawn in time.
+    /// The number of the level to draw for a moving camera: the coarsest with at least [`DENSE`] splats per pixel, or a coarser one if only
+    /// the fraction `affordable` of the scene's splats can be drawn in time.
     pub fn choose(&self, camera: &Camera, affordable: f32) -> usize {
         let Some(coarsest) = self.levels.last() else { return 0 };
         let by_time = (-affordable.log2()).ceil() as usize;
@@ -47,7 +47,7 @@ impl Levels {
     }
 }
 
-/// Splats in view for each pixel of the box that holds most of them.
+/// Splats in view per pixel of the box that contains most of them.
 fn splats_a_pixel(splats: &Splats, camera: &Camera) -> f32 {
     let k = &camera.intrinsics;
     let size = Vec2::new(k.width as f32, k.height as f32);

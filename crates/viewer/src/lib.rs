@@ -12,15 +12,15 @@
 //!
 //! | file | idea |
 //! |---|---|
-//! | `subject.rs`, `views.rs`, `live.rs` | what is looked at: a scene, its photographs, a training |
-//! | `desk.rs`, `pace.rs`, `draw.rs` | who wants which picture, when it is drawn, at which size |
+//! | `subject.rs`, `views.rs`, `live.rs` | what is shown: a scene, its photographs, a training |
+//! | `desk.rs`, `pace.rs`, `draw.rs` | which pictures pages request, when they are drawn, at which size |
 //! | `levels.rs` | which level of detail a moving camera gets |
 //! | `paint.rs`, `palette.rs` | a camera's picture: colours, depth, normals, counts, ellipses, errors |
 //! | `editing/` | selections and edits of a finished scene, which all pages share |
-//! | `compact.rs`, `importance.rs` | splats as they travel to a browser that draws them itself, most important first |
+//! | `compact.rs`, `importance.rs` | the format of splats for browsers that draw them, most important first |
 //! | `kernels.rs` | the program's compute shaders, for browsers with WebGPU |
 //! | `share.rs` | a scene as one page, or a folder for a web server |
-//! | `listen.rs`, `guard.rs`, `serve.rs`, `page.rs` | addresses, who may talk to us, and what is answered |
+//! | `listen.rs`, `guard.rs`, `serve.rs`, `page.rs` | addresses, access control, and routes |
 //! | `client.rs`, `message.rs` | the socket of one page |
 //!
 //! The page itself is in `page/`: plain modules, styles and shaders, embedded as they are.

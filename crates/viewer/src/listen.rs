@@ -12,15 +12,15 @@ use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::{Notify, Semaphore};
 
-/// The port if none is named.
+/// The default port.
 pub const DEFAULT_PORT: u16 = 7979;
-/// Ports that are tried after a taken one.
+/// Number of ports that are tried after a taken one.
 const MORE_PORTS: u16 = 50;
-/// Connections at once; further ones are closed at once. A page needs up to seven.
+/// Maximum number of connections; further ones are closed immediately. A page needs up to seven.
 const CONNECTIONS: usize = 96;
-/// Time to send a request.
+/// Time in which a client must send the head of a request.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// Bytes of a request's head.
+/// Maximum bytes of a request's head.
 const HEAD: usize = 16 << 10;
 
 /// Where to listen.
@@ -123,7 +123,7 @@ pub(crate) async fn accept(
             http.timer(TokioTimer::new())
                 .header_read_timeout(PATIENCE)
                 .max_buf_size(HEAD);
-            // A broken connection is the client's affair.
+            // A broken connection is the client's problem.
             let _ = http
                 .serve_connection(TokioIo::new(stream), service)
                 .with_upgrades()

@@ -1,4 +1,4 @@
-//! A running training: its state for the pages, and their wishes for it.
+//! A running training: its state for the pages, and their requests to it.
 
 use crate::message::Action;
 use irradia_runs::{Run, Snapshot, Snapshots};
@@ -12,14 +12,14 @@ use serde_json::{Value, json};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
-/// Points of a curve at most: more would not be visible. Beyond it every second one is dropped.
+/// Maximum number of points of a curve: more would not be visible. When it is exceeded, every second one is dropped.
 const CURVE_POINTS: usize = 1024;
-/// Points of the plan.
+/// Number of points of the plan.
 const PLAN_POINTS: usize = 200;
 /// Time over which the speed is averaged, seconds.
 const SPEED_OVER: f64 = 3.0;
 
-/// What the training does.
+/// The phase of the training.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum Phase {
@@ -29,7 +29,7 @@ pub(crate) enum Phase {
     Finished,
 }
 
-/// The pages' wishes.
+/// The requests of pages.
 #[derive(Default)]
 struct Control {
     paused: bool,
@@ -45,7 +45,7 @@ struct History {
     curve: Vec<CurvePoint>,
     /// Steps between points of the curve.
     apart: u64,
-    /// Changes when points were dropped.
+    /// How many times points have been dropped.
     thinned: u64,
     stages: Vec<(u64, String)>,
     /// Moving average of the training views' squared error.
@@ -56,7 +56,7 @@ struct History {
     warning: Option<String>,
 }
 
-/// A part of the history for a page that has the rest.
+/// The part of the history that a page already has.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Known {
     points: usize,
@@ -67,7 +67,7 @@ pub(crate) struct Live {
     snapshots: Snapshots,
     control: Mutex<Control>,
     history: Mutex<History>,
-    /// When the next copy of the scene may be taken; `None` while nobody looks.
+    /// When the next copy of the scene may be taken; `None` while no page is open.
     due: Mutex<Option<Instant>>,
     /// Called when the scene may have changed.
     pub on_change: OnceLock<Box<dyn Fn() + Send + Sync>>,
@@ -129,7 +129,7 @@ impl Live {
         }
     }
 
-    /// The last copy of the scene that was taken.
+    /// The latest copy of the scene.
     pub fn newest(&self) -> Option<Arc<Snapshot>> {
         self.snapshots.last()
     }
@@ -144,7 +144,7 @@ impl Live {
         *lock(&self.due) = due;
     }
 
-    /// Someone has begun to look: a copy is taken now unless one is awaited.
+    /// A page was opened: a copy is taken now unless one is scheduled.
     pub fn look(&self) {
         lock(&self.due).get_or_insert_with(Instant::now);
     }
@@ -260,11 +260,11 @@ impl Live {
         }
     }
 
-    /// Requests a copy of the scene if one is due, and announces one that was taken.
+    /// Requests a copy of the scene if one is due, and announces that the scene may have changed.
     fn take_copies(&self) {
         let mut due = lock(&self.due);
         if due.is_some_and(|due| due <= Instant::now()) {
-            // The desk sets the next time when it has drawn this copy; until then one a minute.
+            // The next time is set when this copy has been drawn; until then there is one copy a minute.
             *due = Some(Instant::now() + Duration::from_secs(60));
             self.snapshots.request();
         }
@@ -308,7 +308,7 @@ impl History {
     }
 }
 
-/// Memory in use, bytes, to a few MiB; 0 where the system does not report it.
+/// Memory in use, bytes, in steps of 8 MiB; 0 if the system does not report it.
 fn memory() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
@@ -316,7 +316,7 @@ fn memory() -> u64 {
     (kib.unwrap_or(0) >> 13) << 23
 }
 
-/// What a [`Watcher`] answers for: a request to save must not end a pause.
+/// What an observer of a [`Watcher`] answers. Saving is separate, since a request to save must not end a pause.
 #[derive(Clone, Copy)]
 enum Role {
     Controls,

@@ -1,4 +1,4 @@
-//! What a page asks for, and what it is told. Text messages are JSON; pictures are binary: the length of a JSON header (u32,
+//! Messages from and to a page. Text messages are JSON; pictures are binary: the length of a JSON header (u32,
 //! little endian), the header, a JPEG.
 
 use glam::{Quat, Vec3};
@@ -6,11 +6,12 @@ use irradia_edit::{Edit, EditError, EditList, Operation, SelectStep};
 use irradia_scene::{Camera, Intrinsics, Pose};
 use serde::{Deserialize, Serialize};
 
-/// Largest message accepted from a page, bytes: a list of some hundred lassos of [`MAX_POINTS`], each 64 kB; other requests take a few hundred.
+/// Largest message accepted from a page, bytes: a list of a few hundred lassos of [`MAX_POINTS`], 64 kB each; other requests take a few
+/// hundred.
 pub const MAX_REQUEST: usize = 16 << 20;
-/// Corners of a polygon and points of a stroke.
+/// Maximum number of corners of a polygon or points of a stroke.
 pub const MAX_POINTS: usize = 2000;
-/// Steps of one request to select.
+/// Maximum number of steps in one request to select.
 const MAX_STEPS: usize = 8;
 /// Largest side of a picture, pixels.
 pub const MAX_SIDE: u32 = 4096;
@@ -130,7 +131,7 @@ impl RawShot {
 pub enum Action {
     /// Pause after the current step.
     Pause,
-    /// Go on.
+    /// Resume after a pause.
     Resume,
     /// One step, then pause.
     Step,
@@ -146,7 +147,7 @@ pub enum Action {
 pub enum Request {
     /// Draw this until told otherwise.
     Shot(RawShot),
-    /// The page draws itself.
+    /// The page draws its own pictures: none are needed.
     Rest,
     /// The picture `id` is on the screen.
     Shown {
@@ -181,32 +182,32 @@ pub enum Request {
     Edit(EditRequest),
 }
 
-/// A request of a page that edits. Positions and lengths are those of the world in which the page draws.
+/// An edit request of a page. Positions and lengths are those of the world in which the page draws.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(tag = "do", rename_all = "snake_case")]
 pub enum EditRequest {
-    /// Change what is selected.
+    /// Change the selection.
     Select {
         /// A request of the same gesture as the one before replaces it.
         #[serde(default)]
         gesture: u64,
-        /// Whether what was selected before is forgotten.
+        /// Whether the previous selection is discarded.
         #[serde(default)]
         replace: bool,
-        /// Made one after the other.
+        /// Applied one after the other.
         steps: Vec<SelectStep>,
     },
     /// Select nothing.
     Deselect,
-    /// Edit what is selected.
+    /// Edit the selected splats.
     Edit {
         /// A request of the same gesture as the one before replaces it.
         #[serde(default)]
         gesture: u64,
-        /// The whole scene instead.
+        /// Whether to edit the whole scene instead.
         #[serde(default)]
         whole: bool,
-        /// What is done.
+        /// The operation.
         edit: Operation,
     },
     /// Make the edits of a list.
@@ -216,16 +217,16 @@ pub enum EditRequest {
     },
     /// Undo the last selection or edit.
     Undo,
-    /// Make it again.
+    /// Redo what was undone last.
     Redo,
-    /// Undo or make again until the first of the list are made.
+    /// Undo or redo entries until the first `at` of the list are made.
     Go {
         /// Their number.
         at: usize,
     },
     /// Show the scene as it was opened, or as it is.
     Compare {
-        /// As it was.
+        /// As it was opened.
         before: bool,
     },
     /// Write list and scene beside the scene's file.
@@ -233,7 +234,7 @@ pub enum EditRequest {
 }
 
 impl EditRequest {
-    /// By which requests replace each other.
+    /// The gesture by which requests replace each other.
     pub fn gesture(&self) -> Option<u64> {
         match self {
             Self::Select { gesture, .. } | Self::Edit { gesture, .. } => Some(*gesture).filter(|gesture| *gesture != 0),
@@ -250,12 +251,12 @@ impl EditRequest {
             Self::Select { steps, .. } => {
                 if !(1..=MAX_STEPS).contains(&steps.len()) {
                     return Err(EditError::Selection(format!(
-                        "a page selects in 1 to {MAX_STEPS} steps at once"
+                        "a request to select has 1 to {MAX_STEPS} steps"
                     )));
                 }
                 if steps.iter().any(|step| points(step) > MAX_POINTS) {
                     return Err(EditError::Selection(format!(
-                        "a page draws at most {MAX_POINTS} points at once"
+                        "a selection step has at most {MAX_POINTS} points"
                     )));
                 }
                 steps.iter().try_for_each(SelectStep::check)
@@ -290,7 +291,7 @@ pub struct PictureHeader {
     pub width: u32,
     /// Pixels of the JPEG.
     pub height: u32,
-    /// Whether this is as good as it gets.
+    /// Whether no better picture follows.
     pub sharp: bool,
     /// Version of the scene.
     pub version: u64,
@@ -316,7 +317,7 @@ pub fn picture(header: &PictureHeader, jpeg: &[u8]) -> Vec<u8> {
 pub struct Picked {
     /// Of the request.
     pub tag: String,
-    /// Where the ray meets the surface: half of the light comes from before it. World; `None` where nothing is.
+    /// Where the ray meets the surface: half of the light comes from in front of it. World; `None` if there is nothing.
     pub point: Option<[f32; 3]>,
     /// Its depth along the camera's +Z, world units.
     pub depth: Option<f32>,
@@ -324,7 +325,7 @@ pub struct Picked {
     pub splat: Option<PickedSplat>,
 }
 
-/// A splat and its part in a pixel.
+/// A splat and its contribution to a pixel.
 #[derive(Clone, Debug, Serialize)]
 pub struct PickedSplat {
     /// Index in the file.

@@ -1,4 +1,4 @@
-//! Lines for the user of the program: each kind of refusal is told once, however often it happens.
+//! Lines for the user of the program: each kind of refusal is reported once, however often it happens.
 
 use std::collections::HashSet;
 use std::fmt::Display;
@@ -20,7 +20,7 @@ impl Notices {
         }
     }
 
-    /// Tells `line` if nothing of this `kind` has been told.
+    /// Reports `line` if nothing of this `kind` has been reported.
     pub fn once(&self, kind: &'static str, line: impl Display) {
         let mut told = self.told.lock().unwrap_or_else(PoisonError::into_inner);
         if told.insert(kind) {
@@ -28,7 +28,7 @@ impl Notices {
         }
     }
 
-    /// Tells `line`.
+    /// Reports `line`.
     pub fn always(&self, line: impl Display) {
         (self.tell)(&line.to_string());
     }

@@ -1,17 +1,17 @@
-//! How much is drawn: as many pixels and splats as fit into a frame's time while the camera moves, then step by step all of them.
+//! How much is drawn: as many pixels and splats as fit into a frame's time while the camera moves, then all of them step by step.
 
 use crate::message::{MAX_PIXELS, Shot};
 
 /// Seconds of drawing and encoding a picture of a moving camera: 25 pictures a second.
 const MOVING: f32 = 0.04;
-/// The same while a training shares the processor: smaller pictures, so that as many remain beside its steps.
+/// The same while a training shares the processor: smaller pictures, so that the rate stays the same beside its steps.
 const MOVING_IN_TRAINING: f32 = 0.015;
 /// Seconds within which a camera at rest gets a better picture.
 const RESTING: f32 = 0.2;
-/// Least share of the window's pixels.
+/// Minimum share of the window's pixels.
 const LEAST: f32 = 0.03;
-/// Share of a moving picture's time that half of the splats must leave unused at every pixel before all of them are drawn: all take
-/// less than twice the time.
+/// All splats are drawn while moving if half of them, at all pixels, take less than this share of a moving picture's time: all take less
+/// than twice the time.
 const SPARE: f32 = 0.5;
 
 /// How much of a picture is drawn.
@@ -30,14 +30,14 @@ pub(crate) struct Detail {
 }
 
 impl Detail {
-    /// The largest share of splats that is not all.
+    /// The largest share of splats below all of them.
     pub const MOST_SPLATS: f32 = 0.5;
 }
 
-/// The cost of pictures as measured.
+/// The measured cost of pictures.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Pace {
-    /// Seconds per pixel of the last picture, with what does not depend on the pixels.
+    /// Seconds per pixel of the last picture, fixed cost included.
     per_pixel: f32,
     /// Share of the window's pixels drawn while moving.
     share: f32,
@@ -67,7 +67,7 @@ impl Pace {
         Detail {
             seconds: if training { MOVING_IN_TRAINING } else { MOVING },
             pixels: self.share.min(most(shot)),
-            // Coarser pixels hide that fewer splats are drawn.
+            // Coarser pixels hide the missing splats.
             splats: if self.all {
                 1.0
             } else {
@@ -98,7 +98,7 @@ impl Pace {
     pub fn learn(&mut self, detail: &Detail, pixels: f32, seconds: f32) {
         self.per_pixel = seconds / pixels.max(1.0);
         if detail.moving {
-            // Part of the cost is fixed, so that it grows slower than the share: several pictures find it.
+            // Part of the cost is fixed, so it grows more slowly than the share: finding the share takes several pictures.
             let factor = (detail.seconds / seconds.max(1e-4)).clamp(0.4, 1.4);
             self.share = (self.share * factor).clamp(LEAST, 1.0);
             self.all = if self.all {

@@ -8,7 +8,7 @@ const SCRIPT: &str = "text/javascript; charset=utf-8";
 const TEXT: &str = "text/plain; charset=utf-8";
 const JSON: &str = "application/json";
 
-/// What the page gets of [`kernels`].
+/// The name under which the page fetches [`kernels`].
 pub(crate) const KERNELS: &str = "shaders/kernels.json";
 
 macro_rules! files {

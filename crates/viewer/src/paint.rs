@@ -18,13 +18,13 @@ use rayon::prelude::*;
 use std::borrow::Cow;
 use std::sync::Arc;
 
-/// Rows of a field that are drawn between two looks at whether the picture is still wanted.
+/// Rows of a field that are drawn between two checks whether the picture is still wanted.
 const ROWS: u32 = 32;
 /// Opacity of a splat outside the clipping box, before the sigmoid: far below 1/255.
 const HIDDEN: f32 = -30.0;
-/// Error that is drawn in the last colour.
+/// Error that is drawn in the last colour of the map.
 const WORST: f32 = 0.25;
-/// Pixels below this coverage have no depth.
+/// Coverage below which a pixel has no depth.
 const COVERED: f32 = 0.5;
 
 /// A picture, 8 bits, `[H, W, 3]`.
@@ -75,7 +75,7 @@ struct Alteration {
     highlight: bool,
 }
 
-/// What of the scene is altered.
+/// The part of the scene that is altered.
 #[derive(Clone, Copy, PartialEq)]
 enum Part {
     /// [`Painter::most`].
@@ -84,13 +84,13 @@ enum Part {
     Level(usize),
 }
 
-/// Whether levels of detail may stand for the scene: not where splats are shown as such, or selected ones are tinted.
+/// Whether levels of detail may replace the scene: not if individual splats are shown, or selected ones are tinted.
 fn has_levels(edition: &Edition, shot: &Shot) -> bool {
     !edition.levels.all().is_empty() && shot.mode == Mode::Color && !(shot.highlight && edition.selected.is_some())
 }
 
 impl Painter {
-    /// Makes what pictures of this detail need, once a version.
+    /// Prepares what pictures of this detail need, once per version.
     pub fn prepare(&mut self, edition: &Edition, shot: &Shot, detail: &Detail) {
         if detail.splats == 1.0
             || has_levels(edition, shot)
@@ -113,7 +113,8 @@ impl Painter {
         });
     }
 
-    /// Draws `shot` with `width` x `height` pixels, after [`Self::prepare`]; `None` if it is abandoned meanwhile, or its photograph cannot be read.
+    /// Draws `shot` with `width` x `height` pixels, after [`Self::prepare`]; `None` if it is no longer wanted, or its photograph cannot be
+    /// read.
     pub fn paint(
         &mut self,
         edition: &Edition,
@@ -269,7 +270,7 @@ impl Painter {
                 let truth = photo.resized(size.0, size.1).over(background);
                 error_picture(&planes.color, &truth)
             }
-            // A field has no splats: their number and shapes are drawn as its colours.
+            // A field has no splats: colours are drawn instead of counts and shapes.
             _ => (to_rgb(&planes.color), None),
         })
     }
@@ -284,7 +285,7 @@ impl Painter {
         Some(photo)
     }
 
-    /// PSNR of the scene, in the light of the photograph of `view`, against it, dB; `None` if there is none. `index` is the view's.
+    /// PSNR of the scene against the photograph of `view`, in that one's light, dB; `None` without a photograph. `index` is the view's.
     pub fn score(&mut self, edition: &Edition, index: usize, view: &SeenView) -> Option<f64> {
         let scene = edition.scene();
         let photo = view.photo.as_ref()?.load().ok()?;
@@ -424,7 +425,7 @@ fn pixel_of(camera: &Camera, x: f32, y: f32) -> Camera {
     }
 }
 
-/// A copy of `splats`: outside the box hidden, coloured by normals if requested.
+/// A copy of `splats`, hidden outside the clipping box and coloured by normals as requested.
 fn alter(splats: &Splats, alteration: &Alteration) -> Splats {
     let n = splats.len();
     let mut altered = if alteration.normals {
@@ -484,7 +485,7 @@ fn face(splats: &mut Splats, center: Vec3) {
     }
 }
 
-/// A field's view, strip by strip while it is wanted.
+/// Renders a view of a field strip by strip, as long as it is wanted.
 fn field_planes(
     field: &Field,
     camera: &Camera,
@@ -569,7 +570,7 @@ fn snapped(value: f32, up: bool) -> f32 {
     10f32.powf(if up { at.ceil() } else { at.floor() } / 10.0)
 }
 
-/// Depth in logarithmic colours, near is light, between its first and its last percent.
+/// Depth in logarithmic colours, near is light, between the 1st and the 99th percentile.
 fn depth_picture(depth: &[f32], alpha: &[f32]) -> (Vec<u8>, Option<[f32; 2]>) {
     let covered = || depth.iter().zip(alpha).filter(|(d, a)| **a > COVERED && **d > 0.0);
     let mut sample: Vec<f32> = covered().step_by(7).map(|(d, _)| *d).collect();

@@ -1,4 +1,4 @@
-//! Colour maps: from a number in \[0, 1\] to a colour that reads the same in grey.
+//! Colour maps: from a number in \[0, 1\] to a colour; they are also readable in greyscale.
 
 /// Anchors of the map for depth and counts, evenly spaced: dark violet through teal to yellow, close to matplotlib's viridis
 /// (van der Walt and Smith, CC0), whose lightness grows evenly.
@@ -23,7 +23,7 @@ const HEAT: [[f32; 3]; 5] = [
     [1.0, 0.98, 0.85],
 ];
 
-/// The colour in which selected splats are tinted, sRGB, and its share.
+/// The tint of selected splats, sRGB, and its share.
 pub const SELECTED: [f32; 3] = [1.0, 0.72, 0.0];
 pub const SELECTED_SHARE: f32 = 0.6;
 

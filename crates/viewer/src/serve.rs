@@ -1,4 +1,4 @@
-//! What is answered: the page's files, photographs, splats, and the socket. No path of a request names a file.
+//! The routes: the page's files, photographs, splats, and the socket. No path of a request names a file.
 
 use crate::compact::compact_in_order;
 use crate::desk::Desk;
@@ -33,23 +33,23 @@ use tokio::time::timeout;
 
 /// Longer side of a thumbnail, pixels.
 const THUMBNAIL: u32 = 192;
-/// Bytes of thumbnails that are kept.
+/// Maximum bytes of thumbnails that are kept.
 const THUMBNAILS: usize = 16 << 20;
-/// Bytes of a scene that a page sends.
+/// Maximum bytes of a scene that a page sends.
 const MOST_UPLOADED: usize = 1 << 30;
-/// Time to send it.
+/// Maximum time to send it.
 const UPLOADING: Duration = Duration::from_secs(600);
 /// JPEG quality of photographs.
 const QUALITY: u8 = 90;
-/// Splats of a scene whose levels of detail travel to a page as well: larger ones fill the textures of many browsers alone.
+/// Maximum number of splats of a scene whose levels of detail are sent too: larger scenes alone fill the textures of many browsers.
 const WITH_LEVELS: usize = 4_000_000;
-/// Only what this server serves is loaded, and nobody may frame the page.
+/// The page loads only what this server serves, and no other page may frame it.
 const POLICY: &str = "default-src 'self'; img-src 'self' blob: data:; style-src 'self' 'unsafe-inline'; frame-ancestors 'none'; \
                       base-uri 'none'; form-action 'none'";
 
 /// What all requests share.
 pub(crate) struct Shared {
-    /// Of the scene and its photographs: what a browser keeps from the same address may be of others.
+    /// Identifies the scene and its photographs: what a browser has cached for the same address may belong to another scene.
     pub id: String,
     pub subject: Subject,
     pub desk: Desk,
@@ -60,15 +60,15 @@ pub(crate) struct Shared {
     /// The splats of a version, most important first.
     order: Mutex<Option<(u64, Arc<Vec<u32>>)>>,
     thumbnails: Mutex<HashMap<usize, Bytes>>,
-    /// Photographs that may be decoded at once.
+    /// Limits the photographs that are decoded at the same time.
     decoding: Semaphore,
-    /// Scenes that may be packed at once.
+    /// Limits the scenes that are packed at the same time.
     packing: Semaphore,
-    /// Scenes that may be sent at once.
+    /// Limits the scenes that are sent at the same time.
     uploading: Semaphore,
 }
 
-/// The same for the same scene and photographs after a restart, and another for others.
+/// An identifier that stays the same for a scene and its photographs after a restart, and differs for others.
 fn identity(subject: &Subject) -> String {
     let mut hasher = DefaultHasher::new();
     subject.title.hash(&mut hasher);
@@ -139,7 +139,7 @@ pub(crate) fn router(shared: Arc<Shared>) -> Router {
         .with_state(shared)
 }
 
-/// Refuses what the guard refuses; adds the headers that every answer has.
+/// Refuses what the guard refuses; adds the headers of every response.
 async fn guarded(State(shared): App, request: Request, next: Next) -> Response {
     let entry = shared.guard.check(request.method(), request.uri(), request.headers());
     let mut response = match entry {
@@ -231,7 +231,7 @@ async fn selection(State(shared): App, Path(version): Path<u64>) -> Response {
     }
 }
 
-/// The formats in which a scene can be downloaded, by the name that a request gives: the end of a file's name without its dot.
+/// The formats in which a scene can be downloaded, by the name in a request: the extension without its leading dot.
 pub(crate) fn downloads() -> impl Iterator<Item = (&'static str, SplatFormat)> {
     let formats = SplatFormat::ALL.into_iter();
     let files = formats.filter(|format| *format != SplatFormat::SogFolder);
@@ -282,7 +282,7 @@ async fn download(State(shared): App, Path(name): Path<String>) -> Response {
     }
 }
 
-/// Keeps a scene that a page sends, to be merged by an edit with the name that is answered.
+/// Keeps a scene that a page sends, to be merged by an edit; the response has the name by which the edit finds it.
 async fn upload(State(shared): App, Path(name): Path<String>, body: Body) -> Response {
     if shared.subject.editing.is_err() {
         return StatusCode::NOT_FOUND.into_response();
@@ -293,10 +293,10 @@ async fn upload(State(shared): App, Path(name): Path<String>, body: Body) -> Res
     let bytes = match timeout(UPLOADING, to_bytes(body, MOST_UPLOADED)).await {
         Ok(Ok(bytes)) => bytes,
         Ok(Err(_)) => {
-            let why = "the scene is cut off, or larger than 1 GiB: merge it with irradia edit";
+            let why = "the scene is truncated, or larger than 1 GiB: merge it with irradia edit";
             return (StatusCode::PAYLOAD_TOO_LARGE, why).into_response();
         }
-        Err(_) => return (StatusCode::REQUEST_TIMEOUT, "the scene came too slowly").into_response(),
+        Err(_) => return (StatusCode::REQUEST_TIMEOUT, "sending the scene took too long").into_response(),
     };
     let worker = shared.clone();
     let added = tokio::task::spawn_blocking(move || match &worker.subject.editing {

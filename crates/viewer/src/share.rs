@@ -1,6 +1,6 @@
-//! A scene as one page that opens from the disk, without a network, or as a folder for a web server.
+//! A scene as one page that opens from disk, without a network, or as a folder for a web server.
 //!
-//! The page draws with the viewer's own modules and shaders; the import map gives modules their names as `data:` addresses, shaders
+//! The page draws with the viewer's own modules and shaders; an import map names the modules, which are `data:` addresses, and shaders
 //! are gzipped, in base64. The scene is the compact form of `compact.rs`, gzipped, in base64 or in a file beside the page.
 
 use crate::ViewerError;
@@ -19,11 +19,11 @@ use std::path::Path;
 /// Files of a shared folder.
 const SCENE_FILE: &str = "scene.irs.gz";
 const POSTER_FILE: &str = "poster.png";
-/// Size of a start picture when the page is not measured yet.
+/// Size of the start picture, which is drawn before the size of the page is known.
 const POSTER: (u32, u32) = (1280, 720);
-/// Cameras of a flight that the page holds for each second.
+/// Cameras per second of a flight that are stored in the page.
 const KEYS_PER_SECOND: f32 = 5.0;
-/// Tries to meet a limit of bytes by merging splats.
+/// Maximum number of attempts to meet a limit of bytes by merging splats.
 const TRIES: u32 = 5;
 
 /// Modules of the page that draw, in `js/local/`.
@@ -48,15 +48,15 @@ pub struct ShareOptions {
     pub title: String,
     /// A line below the title, such as who made the scene.
     pub credits: String,
-    /// The page, with its scene, has at most this many bytes.
+    /// Maximum number of bytes of the page with its scene.
     pub max_bytes: Option<u64>,
     /// A folder of page, scene and start picture instead of one page.
     pub folder: bool,
-    /// A flight of the camera, which plays until the page is touched and again at the press of a button.
+    /// A flight of the camera, which plays until the page is touched, and again when its button is pressed.
     pub path: Option<Film>,
 }
 
-/// What was written, and what of the scene is in it.
+/// What was written, and how much of the scene it contains.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Shared {
     /// Bytes of all files.
@@ -70,14 +70,15 @@ pub struct Shared {
 /// Writes `scene` as a page at `output`, or as the folder `output`.
 ///
 /// # Errors
-/// When the scene is a field, which the page cannot draw, or empty, a limit of bytes is too small for any scene, or a file cannot be written.
+/// When the scene is a field, which the page cannot draw, or empty, a limit of bytes is too small for any scene, or a file cannot be
+/// written.
 pub fn share(scene: &Scene, output: &Path, options: &ShareOptions) -> Result<Shared, ViewerError> {
     let splats = scene.model.splats().ok_or(ViewerError::NoSplats)?;
     if splats.is_empty() {
         return Err(ViewerError::Empty);
     }
-    // What does not depend on the scene, and the text that holds it.
-    let around = page(scene, options, None).len() as u64;
+    // Bytes of the page without the splats' own.
+    let around = page(scene, options, (!options.folder).then_some(&[])).len() as u64;
     let cost = |packed: &[u8]| match options.folder {
         true => around + packed.len() as u64,
         false => around + (packed.len() as u64).div_ceil(3) * 4,
@@ -147,7 +148,7 @@ fn fitting(
     let mut fewer = Cow::Borrowed(splats);
     for _ in 0..TRIES {
         let share = most.saturating_sub(around) as f64 / (cost(&last.0) - around) as f64;
-        // A little less than the share, since what is left compresses a little worse.
+        // A little less than the share, since fewer splats compress a little worse.
         let count = (last.1 as f64 * share * 0.98) as usize;
         if count == 0 {
             break;
@@ -175,7 +176,7 @@ fn seen(bytes: &[u8]) -> usize {
 fn page(scene: &Scene, options: &ShareOptions, packed: Option<&[u8]>) -> String {
     let module = |name: &str| {
         let (_, text) = file(name).expect("a file of the page");
-        // Modules name each other by their places in the folder; in one page they have names only.
+        // Modules import each other by relative paths; in one page they have only the names of the import map.
         ["../math", "./assets"]
             .into_iter()
             .map(str::to_owned)
@@ -208,7 +209,7 @@ fn page(scene: &Scene, options: &ShareOptions, packed: Option<&[u8]>) -> String 
         .collect();
     let shaders = gzip(json!(shaders).to_string().as_bytes());
     text("text/plain", "shaders", &base64::encode(&shaders));
-    // A worker of a page from the disk can be no module: what it exports is for tests.
+    // A worker of a page opened from disk cannot be a module; its exports, which are for tests only, are removed.
     text(
         "text/plain",
         "order.js",
@@ -226,7 +227,7 @@ fn page(scene: &Scene, options: &ShareOptions, packed: Option<&[u8]>) -> String 
         true => format!("<img class=\"poster\" src=\"{POSTER_FILE}\" alt=\"\">\n"),
         false => String::new(),
     };
-    // The texts last: nothing in them is a place to fill.
+    // The texts last, so that no placeholder is searched for in them.
     include_str!("../share/page.html")
         .replace("{{title}}", &escaped(&options.title))
         .replace("{{credits}}", &escaped(&options.credits))
@@ -237,7 +238,7 @@ fn page(scene: &Scene, options: &ShareOptions, packed: Option<&[u8]>) -> String 
         .replace("{{texts}}", &texts)
 }
 
-/// What the page knows of the scene beside its splats: the camera of `irradia render --orbit`'s first frame, and what it turns about.
+/// What the page needs besides the splats: the camera of the first frame of `irradia render --orbit`, and the point it turns about.
 fn view(scene: &Scene, options: &ShareOptions, in_file: bool) -> serde_json::Value {
     let camera = scene.orbit(1, None)[0];
     let outlook = scene.outlook();
@@ -261,7 +262,7 @@ fn view(scene: &Scene, options: &ShareOptions, in_file: bool) -> serde_json::Val
     })
 }
 
-/// A flight as the page knows it: a few cameras a second, between which it interpolates.
+/// A flight in the form that the page reads: a few cameras per second, between which it interpolates.
 fn path(film: &Film) -> serde_json::Value {
     let step = (film.fps / KEYS_PER_SECOND).round().max(1.0) as usize;
     let last = film
@@ -276,7 +277,7 @@ fn path(film: &Film) -> serde_json::Value {
     json!({ "step": step as f32 / film.fps, "keys": keys.collect::<Vec<_>>() })
 }
 
-/// Text as it stands in HTML.
+/// `text`, escaped for HTML.
 fn escaped(text: &str) -> String {
     text.replace('&', "&amp;")
         .replace('<', "&lt;")

@@ -1,4 +1,4 @@
-//! What is looked at: a scene that stays, or the state of a training.
+//! What is shown: a finished scene, or the state of a training.
 
 use crate::ViewerError;
 use crate::editing::Editing;
@@ -25,9 +25,9 @@ pub(crate) struct Edition {
     pub splats_version: u64,
     /// Whether each splat is selected; `None` if none is.
     pub selected: Option<Arc<Vec<bool>>>,
-    /// How the scene was moved by edits, and with it what stands in it, such as the cameras of views.
+    /// How edits have moved the scene, and with it everything in it, such as the cameras of views.
     pub placement: Transform,
-    /// Levels of detail of these splats, as far as there are any: an edit leaves none.
+    /// Levels of detail of these splats, if there are any: an edit drops them.
     pub levels: Levels,
     /// The light of each view, if it is known.
     pub lights: Option<Arc<Lights>>,
@@ -61,7 +61,7 @@ impl Edition {
         }
     }
 
-    /// Steps of training, if it is a training's.
+    /// Number of training steps, if this is a state of a training.
     pub fn step(&self) -> Option<u64> {
         match &self.held {
             Held::Scene(_) => None,
@@ -75,14 +75,14 @@ pub struct Subject {
     pub(crate) title: String,
     pub(crate) views: Views,
     pub(crate) live: Option<Arc<Live>>,
-    /// Where the length of the unit is kept.
+    /// The run in which the length of the unit is saved.
     pub(crate) folder: Option<RunFolder>,
     /// The recipe as TOML, if known.
     pub(crate) recipe: Option<String>,
     edition: Mutex<Option<Edition>>,
     /// Omissions, one line each.
     pub warnings: Vec<String>,
-    /// The session that edits, or why there is none.
+    /// The editing session, or why there is none.
     pub(crate) editing: Result<Editing, &'static str>,
 }
 
@@ -105,12 +105,12 @@ impl Subject {
         let mut warnings = std::mem::take(&mut scene.notes);
         let dataset = match (data, &folder) {
             (Some(data), _) => Some(reading.read(data)?),
-            // A run's photographs may have moved: its scene can be looked at without them.
+            // A run's photographs may have been moved: its scene can be viewed without them.
             (None, Some(folder)) => TrainInput::of_run(folder.path())
                 .and_then(|mut input| {
-                    // Pictures of the viewer are by a pinhole, and compared with photographs that are.
+                    // The viewer draws pinhole pictures, which are compared with undistorted photographs.
                     input.reading.lenses = Lenses::Undistorted;
-                    input.reading.read(&input.data)
+                    reading.over(input.reading).read(&input.data)
                 })
                 .map_err(|error| warnings.push(format!("no photographs: {error}")))
                 .ok(),

@@ -14,9 +14,9 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 use tokio::sync::Notify;
 
-/// Interval at which a waiting program looks whether it should stop: no load that could be measured.
+/// Interval at which a waiting program checks whether it should stop: the load is not measurable.
 const LOOK: Duration = Duration::from_millis(100);
-/// Time without pages after which nobody watches: a page that is reloaded comes back sooner.
+/// Time without pages after which the viewer counts as closed: a page that is reloaded comes back sooner.
 const GONE: Duration = Duration::from_secs(4);
 
 /// A server with its thread, and the thread that draws; both end when it is dropped.
@@ -69,7 +69,7 @@ impl Viewer {
             let _ = live.on_change.set(Box::new(wake));
         }
         let closing = Arc::new(Notify::new());
-        // Threads of their own: a training keeps its pool, and the system shares the processor between both.
+        // Separate threads: a training keeps its pool, and the system shares the processor between both.
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(rayon::current_num_threads())
             .thread_name(|i| format!("draw-{i}"))
@@ -95,7 +95,7 @@ impl Viewer {
             move || pool.install(|| draw(&shared.subject, &shared.desk))
         };
         let editing = {
-            // With the program's own pool: only scenes at rest are edited.
+            // In the program's global pool: only finished scenes are edited.
             let shared = shared.clone();
             move || {
                 let Ok(editing) = &shared.subject.editing else { return };

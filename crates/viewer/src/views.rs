@@ -18,7 +18,7 @@ pub(crate) struct SeenView {
 pub(crate) struct Views(pub Vec<SeenView>);
 
 impl Views {
-    /// Those of a dataset. `trained` are the cameras of the training views with their refinement, if known.
+    /// The views of a dataset. `trained` are the cameras of the training views with their refinement, if known.
     pub fn of_dataset(dataset: &Arc<Dataset>, trained: Option<&[Camera]>) -> Self {
         let refined = trained.filter(|cameras| cameras.len() == dataset.train.len());
         let view = |(index, view): (usize, &irradia_scene::View)| {
@@ -26,7 +26,7 @@ impl Views {
             let pose = place.and_then(|place| Some(refined?[place].pose));
             let mut camera = view.camera;
             camera.pose = pose.unwrap_or(camera.pose);
-            // Pictures of the page are by a pinhole at rest: photographs with distortion or a rolling shutter do not compare with them.
+            // The page draws pinhole cameras at rest: photographs with distortion or a rolling shutter cannot be compared with them.
             let is_pinhole = camera.is_pinhole();
             camera.shutter = None;
             let k = &mut camera.intrinsics;
@@ -55,7 +55,7 @@ impl Views {
         Self(cameras.iter().enumerate().map(view).collect())
     }
 
-    /// As the page reads them.
+    /// The views in the form that the page reads.
     pub fn to_json(&self) -> Value {
         let view = |view: &SeenView| {
             let (k, pose) = (&view.camera.intrinsics, &view.camera.pose);

@@ -32,8 +32,7 @@ const TABLE: &[(&str, May)] = &[
     ),
     ("viewer", Import(&["scene", "splat", "field", "edit", "train", "runs"])),
     ("irradia", ImportAll),
-    ("python", ImportAll),
-    ("testkit", Import(&["scene", "compute"])),
+    ("testkit", Import(&["scene"])),
     ("xtask", Import(&[])),
 ];
 

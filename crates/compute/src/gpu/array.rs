@@ -4,9 +4,9 @@ use bytemuck::{NoUninit, Pod};
 use std::sync::PoisonError;
 use std::sync::atomic::Ordering;
 
-/// Words between the beginnings of parts that are bound: 256 bytes, which every implementation accepts.
+/// Alignment of parts that are bound, words: 256 bytes, which every implementation accepts.
 pub const PART: usize = 64;
-/// Bytes that are read at once, so that reading a large array takes little memory beside it.
+/// Bytes read at a time, so that reading a large array takes little additional memory.
 const PIECE: usize = 32 << 20;
 
 /// Memory on the device, in words of 32 bits, that grows and never shrinks.
@@ -14,7 +14,7 @@ const PIECE: usize = 32 << 20;
 pub struct Array {
     label: &'static str,
     buffer: wgpu::Buffer,
-    /// Where it begins in the buffer, bytes.
+    /// Start of the array in the buffer, bytes.
     first: u64,
     words: usize,
 }
@@ -30,8 +30,8 @@ impl Array {
         }
     }
 
-    /// `words` of this one from `at` on, as an array of the same memory, for as long as this one does not grow. To be bound, it begins at
-    /// a multiple of [`PART`] words.
+    /// `words` words of this array, starting at word `at`, as an array that shares the memory until this one grows. A part that is to be
+    /// bound must start at a multiple of [`PART`] words.
     pub fn part(&self, at: usize, words: usize) -> Self {
         assert!(at + words <= self.words, "within {}", self.label);
         Self {
@@ -42,24 +42,24 @@ impl Array {
         }
     }
 
-    /// With the words of `values`.
+    /// An array with the words of `values`.
     pub fn of<T: NoUninit>(gpu: &Gpu, label: &'static str, values: &[T]) -> Self {
         let array = Self::zeros(gpu, label, size_of_val(values) / 4);
         array.write(gpu, 0, values);
         array
     }
 
-    /// Words that it has room for.
+    /// Capacity in words.
     pub fn len(&self) -> usize {
         self.words
     }
 
-    /// Whether it has no room.
+    /// Whether the capacity is 0.
     pub fn is_empty(&self) -> bool {
         self.words == 0
     }
 
-    /// Makes room for `words`. If there was too little, its words are zero now.
+    /// Makes room for `words`. If the array has to grow, all its words become zero.
     pub fn reserve(&mut self, gpu: &Gpu, words: usize) {
         if words > self.words {
             // A quarter more: the number of intersections changes from frame to frame.
@@ -70,7 +70,7 @@ impl Array {
         }
     }
 
-    /// Writes `values` from word `at` on, before whatever is submitted later.
+    /// Writes `values` from word `at` on, before all work submitted later.
     pub fn write<T: NoUninit>(&self, gpu: &Gpu, at: usize, values: &[T]) {
         let bytes: &[u8] = bytemuck::cast_slice(values);
         if !bytes.is_empty() {
@@ -78,7 +78,7 @@ impl Array {
         }
     }
 
-    /// Reads words from `at` on into `to`, after everything submitted so far. Where the device has failed, they are zero.
+    /// Reads words from `at` on into `to`, after all work submitted so far. If the device has failed, they are zero.
     pub fn read<T: Pod>(&self, gpu: &Gpu, at: usize, to: &mut [T]) {
         let to: &mut [u8] = bytemuck::cast_slice_mut(to);
         if to.is_empty() {
@@ -97,17 +97,17 @@ impl Array {
         }
     }
 
-    /// As [`Array::read`], all of the first `words`.
+    /// As [`Array::read`], returning the first `words` words.
     pub fn to_vec<T: Pod>(&self, gpu: &Gpu, words: usize) -> Vec<T> {
         let mut values = vec![T::zeroed(); 4 * words / size_of::<T>()];
         self.read(gpu, 0, &mut values);
         values
     }
 
-    /// Whether an array of so many words can be bound.
+    /// Checks that an array of `words` words can be bound.
     ///
     /// # Errors
-    /// When it cannot: the device's limit is said.
+    /// When it cannot; the error contains the device's limit.
     pub fn check(gpu: &Gpu, label: &'static str, words: usize) -> Result<(), DeviceError> {
         let (needed, limit) = (4 * words as u64, gpu.info.largest_array);
         match needed <= limit {
@@ -126,12 +126,12 @@ impl Array {
         &self.buffer
     }
 
-    /// Where word `at` is in the buffer, bytes.
+    /// Position of word `at` in the buffer, bytes.
     pub(super) fn offset(&self, at: usize) -> u64 {
         self.first + 4 * at as u64
     }
 
-    /// All of it, to be bound.
+    /// The whole array, as a binding.
     pub(super) fn binding(&self) -> wgpu::BufferBinding<'_> {
         wgpu::BufferBinding {
             buffer: &self.buffer,
@@ -141,7 +141,7 @@ impl Array {
     }
 }
 
-/// Of memory for so many words: a binding is never empty.
+/// Bytes of memory for `words` words; never 0, since a binding must not be empty.
 fn bytes(words: usize) -> u64 {
     4 * words.max(4) as u64
 }

@@ -11,10 +11,10 @@ pub struct Kernel {
     bound: Mutex<Bound>,
 }
 
-/// What a kernel was run on, so that the next step finds it.
+/// The sets of arrays on which a kernel was run, kept for the next step.
 #[derive(Debug, Default)]
 struct Bound {
-    /// [`Gpu::memory_generation`] for which they were made: later ones would keep memory that is no longer used.
+    /// [`Gpu::memory_generation`] at which they were created: sets of earlier generations may hold memory that is no longer used.
     generation: u64,
     groups: Vec<(Vec<Place>, wgpu::BindGroup)>,
 }
@@ -22,16 +22,16 @@ struct Bound {
 /// Buffer, first byte, words.
 type Place = (wgpu::Buffer, u64, usize);
 
-/// Sets of arrays that a kernel remembers.
+/// Maximum number of sets of arrays that a kernel remembers.
 const REMEMBERED: usize = 16;
 
 impl Kernel {
-    /// Compiles. Drivers keep what they compiled on disk.
+    /// Compiles `shader`. Drivers cache their results on disk.
     pub fn new(gpu: &Gpu, shader: &Shader) -> Self {
         Self::with_constants(gpu, shader, "")
     }
 
-    /// As [`Kernel::new`], with the text `constants` before the shader's.
+    /// As [`Kernel::new`], with the text `constants` before the shader's source.
     pub fn with_constants(gpu: &Gpu, shader: &Shader, constants: &str) -> Self {
         let descriptor = wgpu::ShaderModuleDescriptor {
             label: Some(shader.name),
@@ -46,7 +46,7 @@ impl Kernel {
         }
     }
 
-    /// Binds `arrays`, as the last time if they are the same.
+    /// Binds `arrays`; reuses the bind group of an earlier run on the same arrays.
     fn bind(&self, gpu: &Gpu, arrays: &[&Array]) -> wgpu::BindGroup {
         let mut bound = self.bound.lock().unwrap_or_else(PoisonError::into_inner);
         let generation = gpu.memory_generation();
@@ -88,8 +88,8 @@ impl Kernel {
 
 fn compile(gpu: &Gpu, name: &str, descriptor: wgpu::ShaderModuleDescriptor) -> wgpu::ComputePipeline {
     let mut checks = wgpu::ShaderRuntimeChecks::checked();
-    // A counter in every loop, which also keeps drivers from unrolling it: without, an H100 takes 8.0 ms a step in place of 10.9
-    // (`speed -- gpu 1000000@1920x1080`). Bounds are still checked.
+    // Loop bounding puts a counter into every loop, which also keeps drivers from unrolling it: without it, an H100 takes 8.0 ms per
+    // step instead of 10.9 (`speed -- gpu 1000000@1920x1080`). Array bounds are still checked.
     checks.force_loop_bounding = false;
     // SAFETY: shaders are this project's own, and their loops end: each counts up to a bound, or follows a ray to its end.
     let module = unsafe { gpu.device.create_shader_module_trusted(descriptor, checks) };
@@ -99,7 +99,7 @@ fn compile(gpu: &Gpu, name: &str, descriptor: wgpu::ShaderModuleDescriptor) -> w
         module: &module,
         entry_point: Some("main"),
         compilation_options: wgpu::PipelineCompilationOptions {
-            // Kernels write before they read.
+            // Kernels write this memory before they read it.
             zero_initialize_workgroup_memory: false,
             ..Default::default()
         },
@@ -107,7 +107,7 @@ fn compile(gpu: &Gpu, name: &str, descriptor: wgpu::ShaderModuleDescriptor) -> w
     })
 }
 
-/// Workgroups along one axis at most (WebGPU's limit).
+/// Maximum number of workgroups along one axis (WebGPU's limit).
 const LINE: u32 = 65_535;
 
 /// Kernels that run one after another, recorded to be submitted together.
@@ -121,7 +121,7 @@ pub struct Work<'a> {
 }
 
 impl<'a> Work<'a> {
-    /// Nothing yet.
+    /// Work without any kernel.
     pub fn new(gpu: &'a Gpu) -> Self {
         Self {
             gpu,
@@ -136,8 +136,9 @@ impl<'a> Work<'a> {
         self.gpu
     }
 
-    /// Runs `kernel` with `groups` workgroups on `arrays`, in the order of its bindings. More groups than fit in a line are put into
-    /// rows, and a few more may run: the kernel finds its number with `group_index` and ignores those beyond its data.
+    /// Runs `kernel` with `groups` workgroups on `arrays`, in the order of its bindings. Groups beyond the limit of one axis are
+    /// dispatched in rows, which may add a few: kernels compute the number of a group with `group_index` and ignore those beyond their
+    /// data.
     pub fn run(&mut self, kernel: &Kernel, arrays: &[&Array], groups: usize) {
         if groups == 0 {
             return;
@@ -145,7 +146,7 @@ impl<'a> Work<'a> {
         let bindings = kernel.bind(self.gpu, arrays);
         let profile = self.gpu.profile.get();
         if profile.is_some() {
-            // Times are those of passes.
+            // Times are measured per pass.
             self.pass = None;
         }
         let encoder = &mut self.encoder;
@@ -164,7 +165,7 @@ impl<'a> Work<'a> {
         pass.dispatch_workgroups((groups as u32).div_ceil(rows), rows, 1);
     }
 
-    /// What comes between kernels.
+    /// The encoder, for commands between kernels.
     pub(super) fn encoder(&mut self) -> &mut wgpu::CommandEncoder {
         self.pass = None;
         &mut self.encoder
@@ -191,7 +192,7 @@ impl<'a> Work<'a> {
         }
     }
 
-    /// Hands it to the device, which begins at once.
+    /// Submits the work to the device, which starts at once.
     pub fn submit(self) {
         self.hand_over();
     }

@@ -1,8 +1,8 @@
 //! Compute on any GPU: WGSL on `wgpu` (Vulkan, Metal, DX12), with no toolkit to install.
 //!
 //! A [`Gpu`] owns the device; an [`Array`] is memory there, of 32-bit words; a [`Kernel`] is a compiled shader, and [`Work`]
-//! records kernels that run one after another. Every stage has a twin on the CPU. Sums are made in a fixed order, without
-//! floating-point atomics: the same bytes from run to run on the same device.
+//! records kernels that run one after another. Every stage has a twin on the CPU. Sums are computed in a fixed order, without
+//! floating-point atomics, so that results have the same bytes from run to run on the same device.
 
 mod array;
 mod kernel;
@@ -25,7 +25,7 @@ use std::fmt;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, LazyLock, Mutex, OnceLock, PoisonError};
 
-/// Threads of a workgroup, where a kernel has no reason for another number: what every implementation offers at least.
+/// Default number of threads per workgroup: the largest that every implementation supports.
 pub const GROUP: u32 = 256;
 
 /// What kind of processor an adapter is.
@@ -33,9 +33,9 @@ pub const GROUP: u32 = 256;
 pub enum AdapterKind {
     /// A graphics card.
     Discrete,
-    /// Beside the CPU, with its memory.
+    /// On the same chip as the CPU, sharing its memory.
     Integrated,
-    /// Of a virtual machine, or unknown.
+    /// In a virtual machine, or of unknown kind.
     Other,
     /// The CPU itself, such as Mesa's llvmpipe.
     Software,
@@ -55,9 +55,9 @@ impl fmt::Display for AdapterKind {
 /// An adapter of this machine.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct AdapterInfo {
-    /// As its driver calls it.
+    /// The driver's name for it.
     pub name: String,
-    /// What it is.
+    /// The kind of processor.
     pub kind: AdapterKind,
     /// Vulkan, Metal or DX12.
     pub api: String,
@@ -67,13 +67,13 @@ pub struct AdapterInfo {
     pub largest_array: u64,
     /// Bytes of memory that a workgroup shares.
     pub shared_memory: u32,
-    /// Fewest and most threads of a subgroup; 0 where there are none.
+    /// Minimum and maximum number of threads per subgroup; 0 without subgroups.
     pub subgroup: [u32; 2],
     /// Whether it has everything that irradia needs.
     pub is_usable: bool,
 }
 
-/// Which adapter to take.
+/// Which adapter to open.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Wanted {
     /// A real GPU, not software.
@@ -84,7 +84,7 @@ pub enum Wanted {
     Named(String),
 }
 
-/// An open device. Its work is made in the order in which it is submitted.
+/// An open device. Work runs in the order in which it is submitted.
 pub struct Gpu {
     device: wgpu::Device,
     queue: wgpu::Queue,
@@ -105,7 +105,7 @@ impl fmt::Debug for Gpu {
 
 /// Bytes that a workgroup of the largest kernel shares.
 const SHARED: u32 = 22 << 10;
-/// Storage arrays that a kernel binds at most.
+/// Maximum number of storage arrays that a kernel binds.
 const BINDINGS: u32 = 12;
 
 /// The drivers of this machine, loaded once.
@@ -116,11 +116,12 @@ static INSTANCE: LazyLock<wgpu::Instance> = LazyLock::new(|| {
     })
 });
 
-/// Bytes of stack for a driver's compiler, which may recurse as deep as a shader is large: threads of servers and tests have 2 MB.
+/// Bytes of stack for a driver's compiler, whose recursion may be as deep as a shader is large; threads of servers and tests have only
+/// 2 MB.
 const STACK: usize = 32 << 20;
 
-/// The thread on which drivers are loaded, devices opened and shaders compiled, one after another, until the process ends. NVIDIA's driver
-/// does not stand these at once on several threads (wgpu issue 10234), and may wait forever on a thread that ends after them (8365).
+/// The one thread that loads drivers, opens devices and compiles shaders; it lives as long as the process. NVIDIA's driver does not
+/// tolerate these calls on several threads at once (wgpu issue 10234), and may hang in a thread that ends after them (8365).
 static DRIVER: LazyLock<rayon::ThreadPool> = LazyLock::new(|| {
     let builder = rayon::ThreadPoolBuilder::new().num_threads(1).stack_size(STACK);
     let builder = builder.thread_name(|_| "gpu driver".to_owned());
@@ -190,7 +191,7 @@ impl Gpu {
             Wanted::Named(name) => info.name.to_lowercase().contains(&name.to_lowercase()),
         };
         let mut found: Vec<_> = list().into_iter().filter(|(_, info)| is_wanted(info)).collect();
-        // Of several of one name one that can be used.
+        // Among several of the same name, a usable one comes first.
         found.sort_by_key(|(_, info)| !info.is_usable);
         let Some((adapter, info)) = found.into_iter().next() else {
             return Err(DeviceError::None(match wanted {
@@ -233,15 +234,15 @@ impl Gpu {
         }))
     }
 
-    /// What was opened.
+    /// The adapter that was opened.
     pub fn info(&self) -> &AdapterInfo {
         &self.info
     }
 
-    /// What went wrong on the device since it was opened; from then on, arrays hold unspecified words.
+    /// Reports the first failure of the device since it was opened; after a failure, arrays hold unspecified words.
     ///
     /// # Errors
-    /// When something did.
+    /// When the device has failed.
     pub fn check(&self) -> Result<(), DeviceError> {
         match &*self.failure.lock().unwrap_or_else(PoisonError::into_inner) {
             None => Ok(()),
@@ -249,7 +250,7 @@ impl Gpu {
         }
     }
 
-    /// Reports a failure that the device itself does not see, and those that tests make up.
+    /// Records a failure that the device itself does not detect, or that a test simulates.
     pub fn fail(&self, reason: &str) {
         self.note(failed(&self.info.name, reason));
     }
@@ -258,18 +259,19 @@ impl Gpu {
         note(&self.failure, error);
     }
 
-    /// Changes whenever memory is taken, since what had some before may be gone.
+    /// Changes with every allocation, since it may replace the memory of an existing array.
     fn memory_generation(&self) -> u64 {
         self.memory_generation.load(Ordering::Relaxed)
     }
 
-    /// Bytes of memory in use, as far as the driver tells.
+    /// Bytes of memory in use; 0 if the backend does not report it.
     pub fn held(&self) -> u64 {
         let report = self.device.generate_allocator_report();
         report.map_or(0, |report| report.total_allocated_bytes)
     }
 
-    /// From now on measures each kernel by the device's clock, and waits for every submission. Whether the device has such a clock.
+    /// From now on, measures each kernel by the device's clock, and waits for every submission. Returns whether the device has such a
+    /// clock.
     pub fn start_profile(&self) -> bool {
         let has_clock = self.device.features().contains(wgpu::Features::TIMESTAMP_QUERY);
         if has_clock {
@@ -303,7 +305,7 @@ impl Gpu {
     }
 }
 
-/// Keeps a failure; the first is the cause.
+/// Records a failure, unless there is one already: the first is the cause.
 fn note(failure: &Mutex<Option<DeviceError>>, error: DeviceError) {
     let mut failure = failure.lock().unwrap_or_else(PoisonError::into_inner);
     failure.get_or_insert(error);
@@ -316,7 +318,7 @@ fn failed(name: &str, reason: &str) -> DeviceError {
     }
 }
 
-/// The sum of the bits that are on, for a kernel's flags.
+/// The sum of the bits that are set, for a kernel's flags.
 pub fn flags(bits: &[(bool, u32)]) -> u32 {
     bits.iter().filter(|(on, _)| *on).map(|(_, bit)| bit).sum()
 }

@@ -2,16 +2,16 @@ use super::Gpu;
 use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
 
-/// Kernels of one submission at most.
+/// Maximum number of kernels measured per submission.
 const KERNELS: u32 = 1024;
 
-/// Seconds of each kernel by the device's own clock. While it is on, every submission is waited for.
+/// Seconds of each kernel by the device's own clock. While profiling, the host waits for every submission.
 #[derive(Debug)]
 pub(super) struct Profile {
     queries: wgpu::QuerySet,
     resolved: wgpu::Buffer,
     staging: wgpu::Buffer,
-    /// Seconds of a tick.
+    /// Seconds per tick.
     tick: f64,
     /// Seconds and calls, by kernel.
     pub spent: Mutex<BTreeMap<&'static str, (f64, u64)>>,

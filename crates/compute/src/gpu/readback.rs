@@ -1,13 +1,13 @@
 use super::{Array, Gpu, Work};
 use bytemuck::{Pod, Zeroable};
 
-/// Words on their way from the device to the host. Waiting for them is waiting for the submission that sent them, not for what was
-/// submitted after it, so that the device still has work when the host reads.
+/// Words on their way from the device to the host. The host waits only for the submission that sent them, not for later ones, so that
+/// the device still has work while the host reads.
 #[derive(Debug)]
 pub struct Readback {
     staging: wgpu::Buffer,
     words: usize,
-    /// What sent them, and how many bytes, until they are taken.
+    /// The submission that sent them and their number of bytes, until they are taken.
     sent: Option<(wgpu::SubmissionIndex, u64)>,
 }
 
@@ -26,7 +26,7 @@ impl Readback {
         }
     }
 
-    /// Words that there is room for.
+    /// Capacity in words.
     pub fn words(&self) -> usize {
         self.words
     }
@@ -36,7 +36,7 @@ impl Readback {
         self.sent.is_some()
     }
 
-    /// Waits for what was sent last, of `to`'s length. Where the device has failed, or nothing was sent, it is zero.
+    /// Waits for the words sent last, which must have the length of `to`. They are zero if the device has failed or nothing was sent.
     pub fn take<T: Pod + Zeroable>(&mut self, gpu: &Gpu, to: &mut [T]) {
         to.fill(T::zeroed());
         let Some((submission, bytes)) = self.sent.take() else {
@@ -52,7 +52,7 @@ impl Readback {
 }
 
 impl Work<'_> {
-    /// As [`Work::submit`]; the words of `array` as they are then go to `to`.
+    /// As [`Work::submit`]; afterwards the words of `array` are copied to `to`.
     pub fn submit_reading(mut self, array: &Array, to: &mut Readback) {
         let bytes = 4 * array.len() as u64;
         if to.sent.take().is_some() {

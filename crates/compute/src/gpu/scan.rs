@@ -4,7 +4,7 @@ use crate::shaders::SCAN;
 /// Words of a block.
 const BLOCK: usize = 2048;
 
-/// Exclusive prefix sums of words, by blocks: their sums, the sums before each block, the sums before each word.
+/// Exclusive prefix sums of words, in three kernels: the sums of blocks, the sums before each block, the sums before each word.
 #[derive(Debug)]
 pub struct Scan {
     kernels: [Kernel; 3],
@@ -12,7 +12,7 @@ pub struct Scan {
 }
 
 impl Scan {
-    /// Compiles.
+    /// Compiles the kernels.
     pub fn new(gpu: &Gpu) -> Self {
         Self {
             kernels: SCAN.each_ref().map(|shader| Kernel::new(gpu, shader)),
@@ -20,12 +20,12 @@ impl Scan {
         }
     }
 
-    /// Room for the parameters of one [`Scan::run`] of a submission.
+    /// An array for the parameters of one [`Scan::run`] in a submission.
     pub fn params(gpu: &Gpu) -> Array {
         Array::zeros(gpu, "scan parameters", 4)
     }
 
-    /// `before[i]` becomes the sum of the words of `values` before `i`, for `i < count`. Each run of a submission has its own `params`.
+    /// `before[i]` becomes the sum of the words of `values` before `i`, for `i < count`. Each run in a submission needs its own `params`.
     pub fn run(&mut self, work: &mut Work, params: &Array, values: &Array, before: &Array, count: usize) {
         let (gpu, blocks) = (work.gpu(), count.div_ceil(BLOCK));
         params.write(gpu, 0, &[count as u32, blocks as u32]);

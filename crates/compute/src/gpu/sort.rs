@@ -6,15 +6,15 @@ const BLOCK: usize = 2048;
 /// Bits of a digit.
 const DIGIT: u32 = 8;
 const DIGITS: usize = 1 << DIGIT;
-/// Digits of a workgroup that sums counts up.
+/// Digits per workgroup of the kernel that sums counts.
 const SUMMED: usize = 8;
 
-/// A stable radix sort of words with a word each, as many as the device knows.
+/// A stable radix sort of words, each with a word as its value; only the device needs to know their number.
 #[derive(Debug)]
 pub struct Sort {
     kernels: [Kernel; 3],
     sizes: Kernel,
-    /// Parts of `params`, of each pass.
+    /// Parts of `params`, one per pass.
     passes: Vec<Array>,
     params: Array,
     counts: Array,
@@ -22,7 +22,7 @@ pub struct Sort {
 }
 
 impl Sort {
-    /// Compiles, for keys below `2^bits`.
+    /// Compiles the kernels, for keys below `2^bits`.
     pub fn new(gpu: &Gpu, bits: u32) -> Self {
         let passes = passes(bits);
         let params = Array::zeros(gpu, "sort parameters", passes * PART);
@@ -40,10 +40,11 @@ impl Sort {
         }
     }
 
-    /// Sorts keys, and their values alike, by their lowest `bits` bits. Their number is the first word of `count` and at most `most`.
+    /// Sorts the keys, together with their values, by the lowest `bits` bits of the keys. The number of keys is the first word of `count`,
+    /// and at most `most`.
     pub fn run(&mut self, work: &mut Work, keys: &Array, values: &Array, count: &Array, most: usize, bits: u32) {
         let (gpu, blocks) = (work.gpu(), most.div_ceil(BLOCK));
-        // Behind the blocks, the totals.
+        // The totals follow the blocks.
         self.counts.reserve(gpu, (blocks + 1) * DIGITS);
         for other in &mut self.other {
             other.reserve(gpu, most);
@@ -63,7 +64,7 @@ impl Sort {
     }
 }
 
-/// An even number, so that what is sorted ends where it was.
+/// Number of passes: even, so that the result ends up in the original arrays.
 fn passes(bits: u32) -> usize {
     bits.div_ceil(DIGIT).next_multiple_of(2) as usize
 }

@@ -1,6 +1,6 @@
 use super::*;
 
-/// The device on which tests run: software where there is no other. Without any, tests are skipped, loudly.
+/// The device on which tests run: software if there is no other. Without any, tests are skipped with a message.
 fn gpu() -> Option<Arc<Gpu>> {
     irradia_testkit::gpu_or_skip(|| Gpu::open(&Wanted::Any))
 }
@@ -43,7 +43,7 @@ fn a_kernel_serves_more_arrays_than_it_remembers_and_those_that_have_moved() {
     for round in 0..3u32 {
         for (i, [from, to]) in (0u32..).zip(&mut pairs) {
             if round == 2 {
-                // To other memory.
+                // This moves them to other memory.
                 from.reserve(&gpu, 1000);
                 to.reserve(&gpu, 1000);
             }
@@ -73,7 +73,7 @@ fn sorting_keeps_the_order_of_equal_keys() {
         let key_array = Array::of(&gpu, "keys", &keys);
         let value_array = Array::of(&gpu, "values", &(0..count as u32).collect::<Vec<_>>());
         let mut work = Work::new(&gpu);
-        // Room for more than there are, as where the device alone knows the number.
+        // Room for more keys than there are, as in cases where only the device knows the number.
         let known = Array::of(&gpu, "count", &[count as u32]);
         sort.run(&mut work, &key_array, &value_array, &known, count + count / 3, bits);
         work.submit();

@@ -2,7 +2,7 @@
 //!
 //! Products are exact integers and ties go to the lower index, so that every instruction set gives the same result. Columns
 //! (vectors of `b`) are in the lanes: a tile of 8 rows by 2 vectors of columns stays in registers over all 128 bytes. A product
-//! has at most 23 bits, which leaves 9 of 32 for an index, so that the running best of a lane is one maximum.
+//! has at most 23 bits, which leaves 9 of 32 for an index, so that a single maximum updates the best of a lane with its index.
 
 #[cfg(target_arch = "aarch64")]
 mod neon;
@@ -35,7 +35,7 @@ impl Nearest {
         second: 0,
     };
 
-    /// Takes account of the neighbour `index`, and of others whose products are at most `second`, which is at most `product`.
+    /// Merges the neighbour `index`, and others whose products are at most `second`, which is at most `product`.
     pub fn merge(&mut self, index: u32, product: u32, second: u32) {
         if product > self.product || (product == self.product && index < self.index) {
             self.second = second.max(self.product);
@@ -78,7 +78,7 @@ trait Lanes: Copy {
     const LANES: usize;
     /// Bytes of a vector that a word holds: 4, or 2 widened to 16 bits.
     const STEP: usize;
-    /// Whether rows are offset by -128, which the sums of the columns make up for.
+    /// Whether rows are offset by -128. To compensate, sums of products begin at 128 times the sum of the column.
     const OFFSET_ROWS: bool;
     fn set(self, value: u32) -> Self::V;
     fn load(self, from: &[u32]) -> Self::V;
@@ -94,7 +94,7 @@ trait Lanes: Copy {
 /// Words of `vectors`, `[group][step][member]`, each group padded to `members` with zeros.
 fn pack<L: Lanes>(vectors: &[[u8; BYTES]], members: usize, offset: bool) -> Vec<u32> {
     let flip = if offset { 0x80 } else { 0 };
-    // Of whole words: byte by byte, this took half as long as the search among a thousand.
+    // By whole words: byte by byte, packing took half as long as a search among a thousand vectors.
     let word = |bytes: &[u8]| match *bytes {
         [a, b] => u32::from(a ^ flip) | u32::from(b ^ flip) << 16,
         [a, b, c, d] => u32::from_le_bytes([a, b, c, d]) ^ u32::from_le_bytes([flip; 4]),
@@ -182,7 +182,7 @@ fn merge_lanes<L: Lanes>(lanes: L, keys: [L::V; 2], mut merge: impl FnMut(usize,
 }
 
 /// The products of the block `rows` with two vectors of `columns`: updates the keys of the rows and returns, for both vectors, the
-/// best and second keys of the columns. `start` is what sums begin with.
+/// best and second keys of the columns. `start` holds the initial values of the sums.
 #[inline(always)]
 fn tile_rows<L: Lanes>(
     lanes: L,
@@ -237,7 +237,7 @@ fn tile_rows<L: Lanes>(
 mod tests {
     use super::*;
 
-    /// Pseudo-random vectors; small `range` makes ties.
+    /// Pseudo-random vectors; a small `range` causes ties.
     fn vectors(n: usize, seed: u32, range: u32) -> Vec<[u8; BYTES]> {
         let mut state = seed;
         let mut next = || {

@@ -1,4 +1,4 @@
-//! NEON with dot products (16 products an instruction), which every 64-bit ARM processor since 2018 has, Apple's from the M1 on.
+//! NEON with dot products (16 products per instruction), available on every 64-bit ARM processor since 2018, on Apple's since the M1.
 //! Every `unsafe` block below runs instructions that are available because only [`detect`] creates the token.
 
 use super::{INDEX_BITS, Lanes};

@@ -1,4 +1,4 @@
-//! AVX-512 VNNI (64 products an instruction) and AVX2 (16). Every `unsafe` block below calls an intrinsic whose instructions are
+//! AVX-512 VNNI (64 products per instruction) and AVX2 (16). Every `unsafe` block below calls an intrinsic whose instructions are
 //! available because only [`nearest`] creates the tokens, after detecting them.
 
 use super::{BYTES, INDEX_BITS, Lanes, Nearest, search};
@@ -13,7 +13,7 @@ struct Vnni(());
 #[derive(Clone, Copy)]
 struct Avx2(());
 
-/// As [`super::nearest`]. AVX-512 without VNNI gains little over AVX2, which it uses.
+/// As [`super::nearest`]. AVX-512 without VNNI would gain little over AVX2, so AVX2 is used instead.
 pub(super) fn nearest(level: Level, a: &[[u8; BYTES]], b: &[[u8; BYTES]]) -> [Vec<Nearest>; 2] {
     #[target_feature(enable = "avx512f,avx512bw,avx512vl,avx512vnni,avx2")]
     fn vnni(a: &[[u8; BYTES]], b: &[[u8; BYTES]]) -> [Vec<Nearest>; 2] {

@@ -34,7 +34,7 @@ pub trait Simd: Copy + Send + Sync + 'static {
     /// # Panics
     /// When `from` is shorter.
     fn load(self, from: &[<Self::F as Lanes>::Scalar]) -> Self::F;
-    /// Asks for the cache line of `place`, which will be read soon.
+    /// Prefetches the cache line of `place`, which will be read soon.
     #[inline(always)]
     fn prefetch<T>(self, _place: &T) {}
     /// Sets lane `i` to `f(i)`.

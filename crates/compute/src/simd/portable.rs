@@ -1,4 +1,5 @@
-//! Lanes without run-time dispatch: four `f32`, in the registers that every processor of the architecture has where glam knows them, and one `f64`.
+//! Lanes without run-time dispatch: four `f32`, in the vector registers that every processor of the architecture has if glam supports
+//! them, and one `f64`.
 
 use super::{EXP2, Lanes, Mask, Simd};
 use glam::{BVec4A, Vec4};
@@ -12,7 +13,7 @@ pub struct Portable;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Double;
 
-/// Four `f32`. With an array of them, in which the compiler has to find vectors, `irradia-splat` took twice as long to compile.
+/// Four `f32`. With a plain array, which the compiler has to vectorise, `irradia-splat` took twice as long to compile.
 #[derive(Clone, Copy, Debug)]
 pub struct Four(Vec4);
 

@@ -1,5 +1,5 @@
-//! AVX2 and AVX-512 lanes. The only `unsafe` arithmetic of the project: every block below calls an intrinsic whose
-//! instructions are available because every value derives from a token that only `detect` creates.
+//! AVX2 and AVX-512 lanes. Every `unsafe` block below calls an intrinsic whose instructions are available because every value
+//! derives from a token that only `detect` creates.
 
 use super::{EXP2, Kernel, Lanes, Mask, Simd};
 use std::arch::x86_64::*;

@@ -9,7 +9,7 @@ use crate::sight::views_that_see;
 use crate::subject::subject;
 use crate::{Draft, EditError, Mode, SelectStep, Selection, Shape};
 
-/// The splats that `steps` select, none of them hidden or locked; no steps select nothing.
+/// The splats that `steps` select, none of them hidden or locked; without steps nothing is selected.
 ///
 /// # Errors
 /// When a number is out of range, or a step needs cameras that are not known.
@@ -25,7 +25,7 @@ pub(crate) fn selectable(draft: &Draft) -> Selection {
     selectable
 }
 
-/// As [`select`], among other splats.
+/// Like [`select`], but among the splats `selectable`.
 pub(crate) fn select_among(
     draft: &Draft,
     steps: &[SelectStep],
@@ -96,7 +96,7 @@ fn evaluate(draft: &Draft, shape: &Shape) -> Result<Selection, EditError> {
             region::inside(draft, &Shape::Sphere { center, radius })
         }
         Shape::Invert {} | Shape::Grow { .. } | Shape::Connected { .. } => {
-            unreachable!("they change what is selected so far")
+            unreachable!("they change the current selection")
         }
     })
 }

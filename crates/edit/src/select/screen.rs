@@ -1,4 +1,4 @@
-//! What was drawn over a picture: polygons and strokes.
+//! Selections drawn over a picture: polygons and brush strokes.
 
 use crate::sight::{Observer, SEEN};
 use crate::{Draft, Selection, Viewpoint};
@@ -13,7 +13,7 @@ pub(super) fn polygon(draft: &Draft, camera: &Viewpoint, points: &[[f64; 2]]) ->
         if at.cmplt(low).any() || at.cmpgt(high).any() {
             return false;
         }
-        // Edges to the right of the point: an odd number of them is crossed on the way out.
+        // Counts edges to the right of the point: their number is odd if it is inside.
         let mut inside = false;
         let mut from = corners[corners.len() - 1];
         for to in &corners {
@@ -54,7 +54,7 @@ pub(super) fn brush(draft: &Draft, camera: &Viewpoint, points: &[[f64; 2]], radi
     })
 }
 
-/// Of a selection the splats that the picture shows, if `visible`.
+/// Restricts a selection to the splats that the picture shows, if `visible`.
 pub(super) fn visible_only(draft: &Draft, camera: &Viewpoint, visible: bool, mut selection: Selection) -> Selection {
     if visible {
         let camera = camera.camera(&draft.cloud.world_from_dataset);

@@ -1,4 +1,5 @@
-//! Neighbourhood: growing, connection, clusters. Cells of a grid stand for their splats, so that the cost is that of the splats.
+//! Selections by neighbourhood: growing, connection and clusters. They work on the cells of a grid, so that the cost is linear in the
+//! number of splats.
 
 use crate::{Draft, Selection};
 use glam::DVec3;
@@ -6,10 +7,10 @@ use irradia_splat::Nearest;
 use rayon::prelude::*;
 use std::collections::HashMap;
 
-/// Factor on the median distance of neighbours for a gap that is not given.
+/// Default gap, in units of the median distance to the nearest neighbour.
 const USUAL_GAP: f64 = 4.0;
 
-/// A cell of a grid: its corner in units of its side.
+/// A cell of a grid: the position of its lower corner in units of its side.
 type Cell = [i64; 3];
 
 fn cell_of(position: DVec3, side: f64) -> Cell {
@@ -25,7 +26,7 @@ fn around(cell: Cell) -> impl Iterator<Item = Cell> {
     })
 }
 
-/// What is selected, and all splats within `by` of it.
+/// The selection, and all splats within `by` of it.
 pub(super) fn grown(draft: &Draft, selected: &Selection, by: f64) -> Selection {
     let mut cells: HashMap<Cell, Vec<DVec3>> = HashMap::new();
     for i in selected.indices() {
@@ -41,7 +42,7 @@ pub(super) fn grown(draft: &Draft, selected: &Selection, by: f64) -> Selection {
     })
 }
 
-/// The component of each splat, where cells of side `gap` that touch are connected, and the number of splats in each.
+/// The connected component of each splat, and the number of splats in each component; touching cells of side `gap` are connected.
 struct Components {
     of: Vec<u32>,
     sizes: Vec<usize>,
@@ -88,7 +89,7 @@ fn components(draft: &Draft, gap: Option<f64>) -> Components {
     Components { of, sizes }
 }
 
-/// What is selected, and everything connected to it.
+/// The selection, and everything connected to it.
 pub(super) fn connected(draft: &Draft, selected: &Selection, gap: Option<f64>) -> Selection {
     let components = components(draft, gap);
     let mut reached = vec![false; components.sizes.len()];
@@ -107,7 +108,7 @@ pub(super) fn clusters(draft: &Draft, min: Option<usize>, max: Option<usize>, ga
     })
 }
 
-/// Median distance of splats to their nearest neighbours, dataset units; 1 if there are no two.
+/// Median distance of splats to their nearest neighbours, dataset units; 1 if there are fewer than two.
 pub(crate) fn usual_distance(draft: &Draft) -> f64 {
     let means = &draft.cloud.means;
     if means.len() < 2 {

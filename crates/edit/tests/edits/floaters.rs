@@ -7,7 +7,7 @@ use irradia_scene::{GaussianCloud, Photo, Rng, sh};
 use irradia_splat::{RenderOptions, Renderer, Splats, ViewParams, logit};
 
 const KINDS: [&str; 5] = ["isolated", "needle", "huge", "unseen", "in front"];
-/// Floaters of a kind.
+/// Number of floaters of each kind.
 const EACH: usize = 100;
 
 fn push(cloud: &mut GaussianCloud, mean: Vec3, scales: [f32; 3], rotation: Quat, opacity: f32, color: f32) {
@@ -18,7 +18,7 @@ fn push(cloud: &mut GaussianCloud, mean: Vec3, scales: [f32; 3], rotation: Quat,
     cloud.sh.extend([sh::dc_from_color(color); 3]);
 }
 
-/// A ball of radius 0.7 around which the cameras stand, in a room of radius 6: splats as flat and dense as training makes them.
+/// A ball of radius 0.7 surrounded by the cameras, in a room of radius 6, of splats as flat and dense as training makes them.
 fn scene(scale: f32) -> Draft {
     let mut cloud = GaussianCloud::default();
     let mut rng = Rng::new(3, 0);
@@ -121,7 +121,7 @@ fn planted_floaters_are_found_and_the_scene_stays() {
         KINDS.iter().zip(&each).collect::<Vec<_>>()
     );
     assert!(each.iter().all(|found| *found >= 90), "{each:?}");
-    // In a clean scene there is next to nothing to find.
+    // A clean scene has almost no floaters.
     let mut same = clean.clone();
     make(&mut same, "delete floaters");
     assert!(same.len() * 1000 >= n * 999);
@@ -151,12 +151,12 @@ fn without_cameras_geometry_finds_what_it_can() {
     let scores = floater_scores(&planted);
     let found = |range: std::ops::Range<usize>| scores[range].iter().filter(|score| score.score() >= 1.0).count();
     assert!(found(0..n) * 1000 <= n);
-    // What is far from everything; not what only a view shows to be in front, or large for a camera.
+    // Splats far from everything are found; those that only a view shows to be in front, or large relative to a camera, are not.
     let unseen = found(n + 3 * EACH..n + 4 * EACH);
     assert!(unseen >= 90, "{unseen}");
 }
 
-/// What the cameras of `draft` see of it.
+/// Photographs of `draft`, rendered for its cameras.
 fn photographs(draft: &Draft) -> Photographs {
     let splats = Splats::from_cloud(&draft.cloud);
     let mut renderer = Renderer::new();
@@ -182,7 +182,7 @@ fn photographs(draft: &Draft) -> Photographs {
     })
 }
 
-/// By its shape alone a part of a plain wall is a veil.
+/// By shape alone, part of a plain wall looks like a veil.
 #[test]
 fn photographs_tell_a_wall_from_a_veil() {
     let mut clean = scene(1.0);
@@ -216,7 +216,7 @@ fn photographs_tell_a_wall_from_a_veil() {
         !wall_is_found && found >= 95 && lost * 100 <= wall,
         "{wall_is_found} {found} {lost}"
     );
-    // What looks different from its photographs is not judged by them; deleting leaves the rest as it was.
+    // A scene that no longer matches its photographs is not judged by them; deleting leaves the rest unchanged.
     crate::make(&mut planted, "delete sphere center=0,0,0 radius=0.1");
     assert!(planted.photographs.is_some());
     crate::make(&mut planted, "recolor exposure=1");

@@ -158,7 +158,7 @@ fn every_edit_survives_its_words_and_its_toml_and_its_json() {
     }
 }
 
-/// Every operation and shape on scenes with nothing, one splat, coincident and non-finite ones.
+/// Every operation and shape on an empty scene, and on scenes of one splat, of coincident splats and of non-finite ones.
 #[test]
 fn odd_scenes_do_no_harm() {
     let mut poisoned = draft(30, 1);

@@ -1,4 +1,4 @@
-//! Properties of edits: identity, inverse, composition, and what renders.
+//! Properties of edits: identity, inverse, composition and rendering.
 
 mod floaters;
 mod hostile;
@@ -50,7 +50,7 @@ fn cameras() -> Vec<Camera> {
         .collect()
 }
 
-/// The edit of a line of text, made.
+/// Applies the edit of a line of text.
 fn make(draft: &mut Draft, line: &str) -> Applied {
     let edit: Edit = line.parse().unwrap_or_else(|error| panic!("{line}: {error}"));
     apply(draft, &edit, &open_nothing).unwrap_or_else(|error| panic!("{line}: {error}"))
@@ -64,7 +64,7 @@ fn edited(draft: &Draft, lines: &[&str]) -> Draft {
     draft
 }
 
-/// Largest difference of any number of two clouds with equally many splats; quaternions up to sign.
+/// Largest difference between corresponding numbers of two clouds with the same number of splats; quaternions up to sign.
 fn difference(a: &GaussianCloud, b: &GaussianCloud) -> f32 {
     assert_eq!((a.len(), a.sh_degree), (b.len(), b.sh_degree));
     assert_eq!(a.world_from_dataset, b.world_from_dataset);

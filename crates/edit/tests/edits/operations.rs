@@ -3,7 +3,7 @@ use glam::{DQuat, DVec3};
 use irradia_edit::{Draft, Edit, History, Operation, apply, open_nothing};
 use irradia_scene::{ExtraColumn, Scalar, Similarity};
 
-/// Edits that change nothing, to the bit.
+/// Edits that do not change a single bit.
 #[test]
 fn neutral_edits_are_the_identity() {
     let before = draft(200, 3);
@@ -23,7 +23,7 @@ fn neutral_edits_are_the_identity() {
         "upright up=0,-1,0 ground=5,0,5",
     ] {
         let mut after = edited(&before, &[line]);
-        // That an edit was made is remembered.
+        // The last selection is remembered.
         after.last.clone_from(&before.last);
         assert!(after == before, "{line}");
     }
@@ -69,7 +69,7 @@ fn inverse_edits_restore_the_scene() {
     }
 }
 
-/// Two edits that are one.
+/// Two edits that equal one.
 #[test]
 fn edits_compose() {
     let before = draft(200, 3);
@@ -259,7 +259,7 @@ fn lengths_and_up_are_as_told() {
         assert!((moved.rotation * up - to).length() < 1e-9);
         assert!(moved.apply(point).dot(to).abs() < 1e-9, "the ground is at height 0");
     }
-    // By the cameras, whose up is near -y here, and no plane.
+    // Up is found from the cameras, where it is near -y, since there is no plane.
     let mut turned = before.clone();
     let applied = make(&mut turned, "upright");
     let Operation::Upright { up: Some(up), .. } = applied.edit.op else {
@@ -317,7 +317,7 @@ fn a_far_move_loses_no_digits() {
     let back = edited(&far, &["move by=-500000,-6000000,0"]);
     assert!(!far.cloud.world_from_dataset.is_identity());
     assert_eq!(far.cloud.means, before.cloud.means);
-    // Doubles have a nanometre there.
+    // Doubles resolve a nanometre there.
     assert!(back.cloud.world_from_dataset.is_identity() && difference(&back.cloud, &before.cloud) < 1e-6);
     let tiny = edited(&before, &["scale factor=0.000001"]);
     assert_eq!(

@@ -1,4 +1,4 @@
-//! What an edited scene looks like: move the scene and the camera alike, and nothing changes.
+//! Rendering of edited scenes: if the scene and the camera move alike, nothing changes.
 
 use crate::{cameras, draft, make};
 use irradia_edit::Draft;
@@ -41,7 +41,7 @@ fn a_moved_scene_renders_as_its_moved_cameras_see_it() {
             assert!(psnr >= 60.0, "{line}: {psnr:.1} dB");
         }
     }
-    // It is not that everything renders alike.
+    // Not everything renders alike.
     let mut turned = before.clone();
     make(&mut turned, "rotate axis=1,2,3 degrees=77");
     assert!(

@@ -10,7 +10,7 @@ fn selected(draft: &Draft, words: &str) -> Selection {
     select(draft, &edit.select.unwrap()).unwrap_or_else(|e| panic!("{words}: {e}"))
 }
 
-/// Splats at given places, alike.
+/// Identical splats at the given positions.
 fn at(means: &[[f32; 3]]) -> Draft {
     let n = means.len();
     let cloud = GaussianCloud {
@@ -129,7 +129,7 @@ fn what_is_drawn_over_a_picture_selects_what_it_covers() {
     };
     assert_eq!(polygon(5.0, false), [0, 1]);
     assert_eq!(polygon(30.0, false), [0, 1, 2]);
-    // The nearer of the two is nearly opaque but not larger than the farther one, which still shows at its rim: make it so.
+    // The nearer of the two is nearly opaque but no larger than the farther one, whose rim still shows: make it larger.
     scene.cloud.log_scales[1] = [0.3f32.ln(); 3];
     scene.cloud.opacity_logits[1] = 9.0;
     scene.cloud.log_scales[0] = [0.01f32.ln(); 3];

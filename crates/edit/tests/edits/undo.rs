@@ -28,7 +28,7 @@ fn open(file: &str) -> Result<GaussianCloud, String> {
     }
 }
 
-/// Random sequences of edits, each undone to the bit, made again, and replayed from the written list.
+/// Random sequences of edits, each undone bit for bit, redone, and replayed from the written list.
 #[test]
 fn every_edit_is_undone_to_the_bit_and_replayed() {
     for seed in 0..12 {

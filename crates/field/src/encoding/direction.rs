@@ -70,7 +70,7 @@ pub fn harmonics<F: Lanes>([x, y, z]: [F; 3]) -> [F; 16] {
     ]
 }
 
-/// The VJP of [`harmonics`], of the polynomials without the constraint to the unit sphere.
+/// The VJP of [`harmonics`] as polynomials in x, y and z, without the unit-sphere constraint.
 #[inline(always)]
 pub fn harmonics_vjp<F: Lanes>([x, y, z]: [F; 3], v: &[F; 16]) -> [F; 3] {
     let k = x.simd();

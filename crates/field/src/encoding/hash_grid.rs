@@ -1,7 +1,7 @@
 //! Multi-resolution hash tables with trilinear interpolation (Mueller et al. 2022, section 3).
 //!
 //! A level of N cells per side has its features at the (N + 1)^3 corners: stored directly if they fit the table, else indexed by
-//! the corner's hash (equation 4). The features of a corner are contiguous, so that a corner is one access.
+//! the corner's hash (equation 4). The features of a corner are contiguous, so that reading them is one access.
 
 use crate::Num;
 use crate::mlp::PANEL;
@@ -9,7 +9,7 @@ use irradia_compute::simd::{Lanes, Scalar, Simd};
 use irradia_compute::unroll;
 use serde::{Deserialize, Serialize};
 
-/// Most features per level.
+/// Maximum number of features per level.
 pub const MAX_FEATURES: usize = 8;
 
 /// Sizes of the encoding.
@@ -20,7 +20,7 @@ pub struct HashGrid {
     pub levels: usize,
     /// F, features per corner: 1, 2, 4 or 8.
     pub features: usize,
-    /// log2 of T, the most entries per level.
+    /// log2 of T, the maximum number of entries per level.
     pub log2_table: u32,
     /// N_min, cells per side of the coarsest level.
     pub coarsest: u32,

@@ -1,27 +1,27 @@
-//! Where the activations of a field's networks lie.
+//! Memory layout of the activations of a field's networks.
 
 use crate::mlp::Mlp;
 use crate::net::Net;
 
-/// Samples over which a workgroup sums the gradients of weights, at least; a multiple of 32.
+/// Minimum number of samples over which a workgroup sums the gradients of weights; a multiple of 32.
 const CHUNK: usize = 256;
-/// Chunks at most: memory for as many gradients of all weights.
+/// Maximum number of chunks; each needs memory for the gradients of all weights.
 pub(super) const CHUNKS: usize = 128;
 
-/// One layer: `Layer` in `layer.wgsl`.
+/// One layer, as `Layer` in `layer.wgsl`.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct DeviceLayer {
     pub inputs: usize,
     pub outputs: usize,
-    /// Outputs as stored with the weights.
+    /// Number of outputs as stored with the weights, padded to eight.
     pub padded: usize,
     weights: usize,
     bias: usize,
     from: usize,
     to: usize,
-    /// Whether it is not the last of its network.
+    /// Whether the outputs go through a ReLU: in all layers but the last of a network.
     relu: bool,
-    /// Inputs whose gradient is wanted, and whether they came through a ReLU.
+    /// Number of inputs whose gradient is needed, and whether they came through a ReLU.
     pub wanted: usize,
     masked: bool,
 }
@@ -35,25 +35,25 @@ impl DeviceLayer {
     }
 }
 
-/// Samples of a chunk.
+/// Number of samples per chunk.
 pub(super) fn chunk(samples: usize) -> usize {
     samples.div_ceil(CHUNKS).next_multiple_of(32).max(CHUNK)
 }
 
-/// The rows of all layers. The encoded direction follows the density and its features, so that these are the input of the colour's
-/// network where they are: its gradients in their rows are then those of the density network's outputs.
+/// The rows of all layers. The encoded direction follows the density and the geometry features, so that the colour network reads its
+/// input in place, and writes the gradients of the density network's outputs into the same rows.
 #[derive(Clone, Debug)]
 pub(crate) struct Layout {
-    /// Those of the density, then those of the colour.
+    /// The layers of the density network, then those of the colour network.
     pub(super) layers: Vec<DeviceLayer>,
-    /// Layers of the density.
+    /// Number of layers of the density network.
     pub densities: usize,
     pub density_row: usize,
     pub direction_row: usize,
     pub rgb_row: usize,
-    /// Rows in all.
+    /// Total number of rows.
     pub rows: usize,
-    /// Parameters of both networks.
+    /// Number of parameters of both networks.
     pub parameters: usize,
 }
 
@@ -88,7 +88,7 @@ impl Layout {
         }
     }
 
-    /// What the shaders know of the field's shape when they are compiled.
+    /// The field's shape as constants that are compiled into the shaders.
     pub fn constants(&self, net: &Net) -> String {
         let (density, _) = net.mlps();
         let levels = net.levels.len();

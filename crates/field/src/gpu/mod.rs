@@ -1,9 +1,9 @@
-//! Fields on any GPU: hash grids marched through an occupancy grid, as Instant-NGP has them (Mueller et al. 2022).
+//! Fields on any GPU: hash grids marched through an occupancy grid, as in Instant-NGP (Mueller et al. 2022).
 //!
-//! A thread marches a ray, with densities evaluated in registers, until the ray is opaque. The samples of all rays then lie side by side,
-//! plane by plane, and go through encoding, networks and compositing, and back. One number is read back on the way, that of the
-//! samples: it determines the sizes of arrays here and the number of rays of the next batch on the host, and nothing is dropped.
-//! The occupancy grid belongs to the host, which asks for densities and returns bits.
+//! A thread marches a ray, with densities evaluated in registers, until the ray is opaque. The samples of all rays are then stored
+//! contiguously, plane by plane, and go through encoding, networks and compositing, forwards and backwards. Only the number of samples
+//! is read back in between: it determines the sizes of arrays here and the number of rays of the next batch on the host, so that no
+//! sample is dropped. The occupancy grid is kept on the host, which requests densities and uploads bits.
 
 mod layout;
 mod training;
@@ -25,7 +25,7 @@ use irradia_compute::gpu::{Array, Gpu, Scan, Work};
 use irradia_compute::simd::{Lanes, Portable, Simd};
 use std::sync::Arc;
 
-/// Whether a field of `config` has a form on GPUs.
+/// Whether GPUs support fields of `config`.
 pub fn supports(config: &FieldConfig) -> bool {
     let net = &config.net;
     let color = net
@@ -36,19 +36,19 @@ pub fn supports(config: &FieldConfig) -> bool {
         && color
         && config.appearance() == 0
         && net.skip.is_none()
-        // The layers that a thread evaluates in registers.
+        // A thread evaluates these layers in registers.
         && (1..=4).contains(&net.depth)
         && net.width <= 128
 }
 
-/// Threads of a workgroup over rays, and over samples.
+/// Workgroup sizes of kernels with one thread per ray, and of those with one thread per sample.
 const RAYS: usize = 64;
 const SAMPLES: usize = 256;
-/// Words of a ray, and where its distances are: `ray.wgsl`.
+/// Number of words of a ray, and the positions of its distances: see `ray.wgsl`.
 const RAY: usize = 20;
 const NEAR: usize = 3;
 const FAR: usize = 7;
-/// Samples of a ray at most: in normalised device coordinates, rays of other cameras than those of the capture may be of any length.
+/// Maximum number of samples per ray: in normalised device coordinates, rays of cameras outside the capture may have any length.
 const MOST_SAMPLES: usize = 1 << 14;
 
 /// The forward pass of a field.
@@ -57,9 +57,9 @@ pub(crate) struct GpuField {
     pub kernels: Kernels,
     pub layout: Layout,
     steps: Steps,
-    /// Most samples of a ray of the last march.
+    /// Maximum number of samples per ray in the last march.
     most: usize,
-    /// What `task.wgsl` says of the field.
+    /// The field's part of `Task` in `task.wgsl`.
     task_of_field: TaskOfField,
     pub table: Array,
     /// Parameters of the networks, layer by layer.
@@ -67,19 +67,19 @@ pub(crate) struct GpuField {
     pub background: Array,
     bricks: Array,
     pub task: Array,
-    /// A `Layer` of `layer.wgsl` each.
+    /// One `Layer` of `layer.wgsl` each.
     pub layers: Vec<Array>,
     pub rays: Array,
     middles: Array,
     counts: Array,
     pub starts: Array,
-    /// `[4, stride]`: points of the unit cube, and middles.
+    /// `[4, stride]`: points in the unit cube, and middles of intervals.
     pub points: Array,
     /// Inputs and outputs of all layers, `[rows, stride]`.
     pub rows: Array,
     scan: Scan,
     scan_params: Array,
-    /// Samples that a plane has room for.
+    /// Capacity of a plane in samples.
     pub stride: usize,
 }
 
@@ -92,9 +92,9 @@ struct TaskOfField {
 
 /// Rays of a batch, and weights of the losses.
 pub(crate) struct Batch {
-    /// [`RAY`] words each.
+    /// One ray each, [`RAY`] words.
     pub rays: Vec<[f32; RAY]>,
-    /// Of a ray, and of a known distance.
+    /// Weights of a ray and of a known distance in the loss.
     pub weights: [f32; 2],
 }
 
@@ -105,9 +105,9 @@ impl GpuField {
     /// When the device refuses a kernel, or has too little memory.
     ///
     /// # Panics
-    /// When the field has no form here: see [`supports`].
+    /// When GPUs do not support the field: see [`supports`].
     pub fn new(gpu: Arc<Gpu>, field: &Field) -> Result<Self, DeviceError> {
-        assert!(supports(&field.config), "a field with a form on GPUs");
+        assert!(supports(&field.config), "a field that GPUs support");
         let Sampler::Occupancy(options) = field.config.sampler else {
             unreachable!("just checked");
         };
@@ -164,7 +164,7 @@ impl GpuField {
         Ok(made)
     }
 
-    /// Uploads the parameters and the occupancy grid of `field`, of the same shape.
+    /// Uploads the parameters and the occupancy grid of `field`, which has the same shape.
     fn upload(&self, field: &Field) {
         let (gpu, parameters) = (&*self.gpu, &field.parameters[0]);
         self.table.write(gpu, 0, &parameters.table);
@@ -193,7 +193,7 @@ impl GpuField {
         self.starts.reserve(&gpu, rays + 1);
         self.write_task(rays, 0, batch.weights);
         let mut work = Work::new(&gpu);
-        // The count after the last ray's is 0, and its start the total.
+        // The count behind the last ray's is 0, so that its start is the total.
         work.clear(&self.counts, rays + 1);
         let arrays = [
             &self.task,
@@ -213,7 +213,7 @@ impl GpuField {
         total[0] as usize
     }
 
-    /// Most steps of a ray of `batch`.
+    /// Maximum number of steps along any ray of `batch`.
     pub fn most_samples(&self, batch: &Batch) -> usize {
         let Steps { shortest, cone } = self.steps;
         let spans = batch.rays.iter().map(|words| (words[NEAR], words[FAR]));
@@ -275,7 +275,7 @@ impl GpuField {
         work.run(&self.kernels.dense, &arrays, groups);
     }
 
-    /// What compositing reads, in the order of its bindings, and then what it writes.
+    /// The arrays that compositing reads, in the order of its bindings, followed by those it writes.
     pub fn composited<'a>(&'a self, written: &[&'a Array]) -> Vec<&'a Array> {
         let read = [
             &self.task,
@@ -288,7 +288,7 @@ impl GpuField {
         [&read[..], written].concat()
     }
 
-    /// Densities at points of the unit cube.
+    /// Densities at points in the unit cube.
     pub fn densities(&mut self, field: &Field, points: &[[f32; 3]]) -> Vec<f32> {
         let gpu = self.gpu.clone();
         let shape = &field.nets[0].shape;
@@ -339,8 +339,8 @@ impl GpuField {
         }
     }
 
-    /// The words of a ray: `goal` is what it shows or how its distances are measured, `behind` the background and whether a learnt one
-    /// takes precedence.
+    /// The words of a ray. `goal` is its target colour and known distance (in training), or the conversion of its distances to the world
+    /// (in rendering); `behind` is the background, and whether a learnt one takes precedence.
     pub fn ray(ray: &Ray, offset: f32, goal: [f32; 4], behind: [f32; 4]) -> [f32; RAY] {
         let mut words = [0.0; RAY];
         let parts = [(&ray.origin, ray.near), (&ray.direction, ray.far), (&ray.view, offset)];
@@ -357,20 +357,20 @@ impl GpuField {
         self.task_of_field.levels.len()
     }
 
-    /// Rays of `batch` whose samples fit into one array before they are counted.
+    /// Number of rays of `batch` that fit into one array with room for the maximum number of samples each.
     pub fn most_rays(&self, batch: &Batch) -> usize {
         (self.gpu.info().largest_array / 4) as usize / self.most_samples(batch)
     }
 
-    /// Samples whose activations fit into one array.
+    /// Number of samples whose activations fit into one array.
     pub fn most_at_once(&self) -> usize {
         (self.gpu.info().largest_array / 4) as usize / self.layout.rows * 4 / 5
     }
 }
 
-/// Words of `Task` in `task.wgsl`.
+/// Number of words of `Task` in `task.wgsl`.
 const TASK: usize = 4 * (5 + 32);
-/// Points of one evaluation of densities.
+/// Number of points per evaluation of densities.
 const QUERIED: usize = 1 << 16;
 
 #[cfg(test)]

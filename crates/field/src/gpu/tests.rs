@@ -121,7 +121,7 @@ fn variants() -> Vec<(&'static str, FieldConfig, Space)> {
     ]
 }
 
-/// A field whose cells are partly empty, away from its initial symmetry.
+/// A field with some empty cells, perturbed away from its initial symmetry.
 fn state(config: FieldConfig, space: Space) -> FieldState {
     let mut field = Field::new(config, space, 5).expect("valid");
     let mut rng = Rng::new(2, 7);
@@ -138,7 +138,7 @@ fn state(config: FieldConfig, space: Space) -> FieldState {
     FieldState::new(field)
 }
 
-/// The largest difference of two lists, in parts of the largest value.
+/// The largest difference between two lists, relative to the largest expected value.
 fn difference(got: &[f32], expected: &[f32]) -> f32 {
     assert_eq!(got.len(), expected.len());
     let scale = expected.iter().fold(1e-12f32, |m, v| m.max(v.abs()));
@@ -200,7 +200,7 @@ fn a_step_has_the_gradients_and_losses_of_the_cpu() {
         let untouched = |list: &[f32]| list.iter().filter(|v| **v == 0.0).count();
         assert!(
             untouched(&got.table).abs_diff(untouched(&expected.table)) <= got.table.len() / 100,
-            "{name}: entries that no sample touches rest"
+            "{name}: entries that no sample touches stay unchanged"
         );
     }
 }

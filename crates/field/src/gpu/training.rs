@@ -11,7 +11,7 @@ use irradia_compute::adam::AdamStep;
 use irradia_compute::gpu::{Array, Gpu, Work};
 use std::sync::Arc;
 
-/// Parameters and moments of a field, and a step on them.
+/// Parameters and moments of a field on a GPU, and the training step.
 pub struct GpuFieldTraining {
     field: GpuField,
     /// Gradients of `field.rows`.
@@ -72,7 +72,7 @@ impl GpuFieldTraining {
     /// When the device refuses a kernel, or has too little memory.
     ///
     /// # Panics
-    /// When the field has no form on GPUs: see [`super::supports`].
+    /// When GPUs do not support the field: see [`super::supports`].
     pub fn new(gpu: Arc<Gpu>, state: &FieldState) -> Result<Self, DeviceError> {
         let field = GpuField::new(gpu.clone(), &state.field)?;
         let of_nets = state.moments.each_ref().map(|moment| {
@@ -100,7 +100,7 @@ impl GpuFieldTraining {
         &self.field.gpu
     }
 
-    /// Takes one step on `batch`. Of `state`, only the number of steps changes.
+    /// Takes one step on `batch`. Changes only the number of steps in `state`.
     pub fn step(&mut self, state: &mut FieldState, batch: &RayBatch, options: &StepOptions) -> StepLoss {
         state.step += 1;
         let (gpu, field) = (self.field.gpu.clone(), &mut self.field);
@@ -129,7 +129,7 @@ impl GpuFieldTraining {
         }
     }
 
-    /// From the gradients of the networks' outputs to those of all parameters.
+    /// Propagates the gradients of the networks' outputs to all parameters.
     fn propagate(&self, work: &mut Work, samples: usize) {
         let field = &self.field;
         for (of, layer) in field.layout.layers.iter().zip(&field.layers).rev() {
@@ -164,7 +164,7 @@ impl GpuFieldTraining {
         work.run(&field.kernels.update_background, &arrays, self.background.len);
     }
 
-    /// Densities at points of the unit cube.
+    /// Densities at points in the unit cube.
     pub(crate) fn densities(&mut self, field: &Field, points: &[[f32; 3]]) -> Vec<f32> {
         self.field.densities(field, points)
     }
@@ -174,7 +174,7 @@ impl GpuFieldTraining {
         self.field.upload_occupancy(field);
     }
 
-    /// `state` with the parameters and moments from here.
+    /// `state` with the parameters and moments read back from the device.
     pub fn download(&self, state: &FieldState) -> FieldState {
         let (gpu, mut state) = (self.gpu(), state.clone());
         let parameters = &mut state.field.parameters[0];

@@ -10,14 +10,14 @@ use irradia_scene::Camera;
 use rayon::prelude::*;
 use std::sync::Arc;
 
-/// Rays of a batch at most.
+/// Maximum number of rays per batch.
 const BATCH: usize = 1 << 15;
 
-/// A field on a GPU, to be looked at.
+/// A field on a GPU, for rendering.
 pub struct GpuFieldRenderer {
     field: GpuField,
     pixels: Array,
-    /// Rays of a batch: fewer where their samples do not fit.
+    /// Number of rays per batch, reduced when their samples do not fit.
     batch: usize,
 }
 
@@ -28,7 +28,7 @@ impl GpuFieldRenderer {
     /// When the device refuses a kernel, or has too little memory.
     ///
     /// # Panics
-    /// When the field has no form on GPUs: see [`super::supports`].
+    /// When GPUs do not support the field: see [`super::supports`].
     pub fn new(gpu: Arc<Gpu>, field: &Field) -> Result<Self, DeviceError> {
         Ok(Self {
             pixels: Array::zeros(&gpu, "pixels", 0),
@@ -37,7 +37,7 @@ impl GpuFieldRenderer {
         })
     }
 
-    /// Renders the view of `camera`, of the field that was uploaded. Normals are not computed.
+    /// Renders the uploaded field as `camera` sees it. Normals are not computed.
     ///
     /// # Errors
     /// When the device fails.
@@ -102,7 +102,7 @@ impl GpuFieldRenderer {
     }
 }
 
-/// The rays of the pixels from `first` on, and the depth along each per world unit.
+/// The rays of as many pixels as `cosines`, starting at pixel `first`; writes the depth per world unit along each ray to `cosines`.
 fn batch_of(field: &Field, camera: &Camera, options: &RenderOptions, first: usize, cosines: &mut [f32]) -> Batch {
     let width = camera.intrinsics.width as usize;
     let [red, green, blue] = options.background;

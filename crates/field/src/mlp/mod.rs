@@ -168,7 +168,7 @@ impl Mlp {
         parameters
     }
 
-    /// The transposed weights, at the same offsets: the backward pass then uses the products of the forward pass.
+    /// The transposed weights, at the same offsets, so that the backward pass can use the forward pass's product kernel.
     ///
     /// Each layer is packed into tiles `[(inputs + again) / 8, outputs, 8]`.
     pub fn transposed<T: Scalar>(&self, parameters: &[T]) -> Vec<T> {
@@ -210,7 +210,7 @@ impl Mlp {
         }
     }
 
-    /// The VJP: adds to `grads` (flat, as the parameters) and writes the input's gradient to `v_x`, if requested.
+    /// The VJP: adds to `grads` (flat, like the parameters) and writes the input's gradient to `v_x`, if requested.
     ///
     /// `transposed` is [`Self::transposed`]; `x` and `tape` are those of [`Self::forward`], with
     /// [`MlpTape::output_gradient`] filled, zero in the padding rows.

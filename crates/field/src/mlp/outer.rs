@@ -61,7 +61,8 @@ fn columns<S: Simd, const V: usize>(
         for s in (0..PANEL).step_by(S::LANES) {
             for k in (0..wide).step_by(S::LANES) {
                 let (from, to) = (&v[k * PANEL + s..], &mut strip[s * wide + k..]);
-                // Rows beyond the outputs land in lanes that are never added; past the last panel there are none.
+                // Rows beyond the outputs land in lanes that are never added. Behind the last panel there are none: a zero-padded copy
+                // is transposed instead.
                 if from.len() >= (S::LANES - 1) * PANEL + S::LANES {
                     simd.transpose(from, PANEL, to, wide);
                 } else {

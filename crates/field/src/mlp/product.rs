@@ -13,7 +13,7 @@ use irradia_compute::simd::{Lanes, Scalar, Simd};
 pub(super) enum Begin<'a, T> {
     Zero,
     Bias(&'a [T]),
-    /// The present value.
+    /// The current value of the output.
     Add,
 }
 

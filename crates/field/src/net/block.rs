@@ -29,7 +29,7 @@ pub struct Block<T> {
     pub v_encoded: Rows<T>,
     /// Gradient of the colour part's input, `[panels, rows, 32]`.
     pub(super) v_color_in: Rows<T>,
-    /// The derivative of the density by the network's output.
+    /// The derivative of the density with respect to the network's output.
     pub(super) slope: Rows<T>,
     pub(super) density_tape: MlpTape<T>,
     pub(super) color_in: Rows<T>,

@@ -1,4 +1,4 @@
-//! One network of a field: maps an encoded position to density and geometry features, and these with the direction to colour.
+//! One network of a field: maps an encoded position to density and geometry features, and the features with the direction to colour.
 //!
 //! A block of samples is evaluated in three steps, so that occluded samples can be dropped between them:
 //! [`Net::density`], [`Block::keep`], [`Net::color`]; then [`Net::backward`].
@@ -287,7 +287,7 @@ impl Net {
         for p in 0..panels {
             for s in (0..3 * PANEL).step_by(S::LANES) {
                 let x = simd.load(&block.color_tape.output()[p * out_rows * PANEL + s..]);
-                // The sigmoid of -|x|, which does not overflow, mirrored.
+                // exp(-|x|) does not overflow; negative values follow by symmetry.
                 let e = (-x.abs()).exp();
                 let right = one / (one + e);
                 let y = right.select(simd.splat(0.0).le(x), one - right);
@@ -393,7 +393,7 @@ impl Net {
         }
     }
 
-    /// Writes the derivative of each sample's density by its point, `[panels, 3, 32]`, after [`Net::density`].
+    /// Writes the derivative of each sample's density with respect to its point, `[panels, 3, 32]`, after [`Net::density`].
     #[inline(always)]
     pub fn density_slope<S: Simd>(
         &self,

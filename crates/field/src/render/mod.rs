@@ -1,4 +1,4 @@
-//! From samples to pixels and back.
+//! Volume rendering: from samples to pixels, and the gradients back to the samples.
 
 pub mod quadrature;
 pub mod view;

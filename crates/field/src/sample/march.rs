@@ -45,8 +45,8 @@ impl March<'_> {
         ray.near + (offset - 0.5) * self.steps.at(ray.near)
     }
 
-    /// Appends the middles and lengths of up to `most` steps from distance `t` on that lie in occupied cells. Returns the distance
-    /// at which to continue, at or beyond the ray's end when done.
+    /// Appends the middles and lengths of up to `most` steps in occupied cells, starting at distance `t`. Returns the distance at which
+    /// to continue, at or beyond the ray's end when done.
     pub fn advance(&self, ray: &Ray, mut t: f32, most: usize, middles: &mut Vec<f32>, lengths: &mut Vec<f32>) -> f32 {
         let straight = !matches!(self.space.outside, Outside::Contracted);
         let full = middles.len().saturating_add(most);
@@ -79,8 +79,8 @@ impl March<'_> {
             let per_width = self.grid.side as f32 / cells;
             let mut exit = f32::INFINITY;
             for c in 0..3 {
-                // Casts instead of `floor` and `ceil`, which are calls on x86-64 without SSE 4.1. What lies below 0 or above 1
-                // by rounding leaves by one step.
+                // Casts instead of `floor` and `ceil`, which are calls on x86-64 without SSE 4.1. A point that rounding puts below 0 or
+                // above 1 leaves by one step.
                 let cell = (u[c] * per_width) as u32 as f32;
                 let face = if inverse[c] > 0.0 { cell + 1.0 } else { cell } * width;
                 if inverse[c].is_finite() {

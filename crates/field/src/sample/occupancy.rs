@@ -23,7 +23,7 @@ pub struct OccupancyGrid {
 pub enum Cell {
     /// The cell may contain something.
     Occupied,
-    /// All cells around it that share its multiple of `cells` in each coordinate are empty: it, its brick or its block.
+    /// The aligned cube of `cells` cells per side around it is empty: the cell itself, its brick or its block.
     Empty {
         /// Cells per side, 1, 4 or 16.
         cells: u32,
@@ -153,7 +153,7 @@ impl OccupancyGrid {
     }
 }
 
-/// The word, among words of 4 x 4 x 4 with `side` of them per side, and the bit in it that belong to `at`.
+/// The index of the word that contains `at`, in a grid of `side` words per side that hold 4 x 4 x 4 bits each, and of its bit.
 #[inline]
 fn word_of(at: [usize; 3], side: usize) -> (usize, u32) {
     let [x, y, z] = at;

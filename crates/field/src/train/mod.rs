@@ -21,9 +21,9 @@ mod worker;
 
 pub use residual::{ResidualQuery, residual_at, train_residual};
 
-/// Groups per batch: the most threads that can work at once.
+/// Number of groups per batch, which limits how many threads can work at once.
 const GROUPS: usize = 32;
-/// Random streams of a step, beside those of the groups.
+/// Random streams of a step, in addition to those of the groups.
 const STREAM_RAYS: u64 = 0xfe;
 pub(crate) const STREAM_OCCUPANCY: u64 = 0xff;
 
@@ -189,7 +189,7 @@ fn group_of(group: usize, rays: usize, seed: u64, step: u64) -> (std::ops::Range
     (range, Rng::new(seed, (step << 8) + group as u64))
 }
 
-/// The fraction of a step by which the samples of each ray are shifted where an occupancy grid is marched.
+/// The fraction of a step by which the samples of each ray are shifted when marching through an occupancy grid.
 #[cfg(feature = "gpu")]
 pub(crate) fn offsets(rays: usize, seed: u64, step: u64) -> Vec<f32> {
     let of_group = |group| {
@@ -199,7 +199,8 @@ pub(crate) fn offsets(rays: usize, seed: u64, step: u64) -> Vec<f32> {
     (0..GROUPS).flat_map(of_group).collect()
 }
 
-/// Computes all gradients: those of networks, codes and background end up in the first worker, the tables' stay with their points.
+/// Computes all gradients: those of networks, codes and background end up in the first worker; for the tables, each worker keeps its
+/// points with the gradients of their encodings.
 fn gradients(
     level: Level,
     field: &Field,

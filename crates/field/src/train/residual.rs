@@ -1,5 +1,5 @@
 //! A field that adds a view-dependent colour to given points, such as splats, for reflections that harmonics of low degree cannot
-//! represent. Only the colour part of its network is used; positions and visibility are the caller's.
+//! represent. Only the colours of its network are used; the caller determines positions and visibility.
 
 use super::worker::{Backward, Worker};
 use super::{GROUPS, StepOptions, add_up, descend};
@@ -24,8 +24,8 @@ pub struct ResidualQuery {
     pub direction: [f32; 3],
 }
 
-/// The colours that `field` adds at `queries` with the appearance code of `image`, or the mean code: sRGB, within -1..1; zeros outside the
-/// field.
+/// The colours that `field` adds at `queries` with the appearance code of `image`, or the mean code: sRGB, within -1..1; zero outside
+/// the field.
 pub fn residual_at(field: &Field, queries: &[ResidualQuery], image: Option<u32>) -> Vec<[f32; 3]> {
     let (points, directions): (Vec<_>, Vec<_>) = queries.iter().map(|s| (s.point, s.direction)).unzip();
     let (_, inside) = units(field, &points);
@@ -41,8 +41,8 @@ fn residual_of(color: f32) -> f32 {
     2.0 * color - 1.0
 }
 
-/// Takes one step of Adam, given the gradients `v_added` of the colours added at `queries`: the sum of what [`residual_at`] returned for each
-/// of the `images`, times its factor. The points receive no gradient; only the rates of `options` are used.
+/// Takes one step of Adam, given the gradients `v_added` of the colours added at `queries`. An added colour is the sum over `images` of
+/// [`residual_at`] times the image's factor. The points receive no gradient; only the rates of `options` are used.
 pub fn train_residual(
     state: &mut FieldState,
     queries: &[ResidualQuery],

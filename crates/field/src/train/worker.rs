@@ -23,7 +23,7 @@ pub(super) struct Worker {
     pub grads: Vec<NetParameters<f32>>,
     pub codes: Vec<f32>,
     pub background: Vec<f32>,
-    /// For each network the points and the gradients of their encodings, panel by panel.
+    /// For each network, the points and the gradients of their encodings, panel by panel.
     pub stored: Vec<[Vec<f32>; 2]>,
     v_weights: Vec<f32>,
     v_optical_depth: Vec<f32>,
@@ -47,7 +47,7 @@ struct Score {
     squares: f32,
     /// Background of the ray.
     background: [f32; 3],
-    /// The gradient of the batch's mean by the colour.
+    /// The gradient of the batch's mean with respect to the colour.
     v_color: [f32; 3],
 }
 

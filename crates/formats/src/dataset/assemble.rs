@@ -24,11 +24,11 @@ use std::sync::Arc;
 
 /// Minimum number of views of a scene.
 const MIN_VIEWS: usize = 3;
-/// The ratio of the shapes of a photograph and of its camera from which on they differ, beyond the rounding of small copies.
+/// Minimum ratio between the aspect ratios of a photograph and its camera for them to count as different; small copies are rounded.
 const STRETCHED: f64 = 1.03;
 /// Maximum number of names in a warning.
 const MAX_NAMES: usize = 20;
-/// Photographs of a camera in which its image circle is searched.
+/// Number of photographs of a camera in which its image circle is searched.
 const CIRCLE_SAMPLES: usize = 4;
 
 /// Why a view was skipped; each reason is one warning.
@@ -61,7 +61,7 @@ struct Probed {
     source: Intrinsics,
     /// Set for distorted cameras by [`plan_cuts`], unless photographs are kept as they are.
     cut: Option<Cut>,
-    /// What a photograph that is kept as it is shows, if not all.
+    /// The usable part of a photograph that is kept as it is; `None` if all of it is usable.
     shown: Option<Shown>,
 }
 
@@ -99,12 +99,12 @@ pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<D
     }
     views.sort_by(|a, b| a.name.cmp(&b.name));
     let declared = views.len();
-    // A copy of a held-out view would be trained on.
+    // Otherwise a copy of a held-out view might be trained on.
     views.dedup_by(|again, first| again.image.is_some() && again.image == first.image);
     let named = views.len();
     if named < declared {
         warnings.push(format!(
-            "{} of {declared} views are left out: their photographs are those of others",
+            "{} of {declared} views are left out: other views use the same photographs",
             declared - named
         ));
     }
@@ -112,7 +112,8 @@ pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<D
         let moving = readout::of_neighbours(&mut views, readout);
         if moving < named {
             warnings.push(format!(
-                "{} of {named} photographs are taken as if exposed at once: their names have no numbers of frames, no neighbour has a pose, or they would turn by more than half a radian",
+                "{} of {named} photographs are taken as if exposed at once: their names have no frame numbers, no neighbour has a pose, or \
+                 they would rotate by more than half a radian",
                 named - moving
             ));
         }
@@ -209,7 +210,8 @@ fn probe(view: &DeclaredView, ignores_exif: bool) -> Result<Probed, Skipped> {
     })
 }
 
-/// Plans the pinhole images of every distinct distorted camera once, for all views that share it, or what its photographs show as they are.
+/// Plans once for every distinct distorted camera, for all views that share it, its pinhole images, or the usable part of photographs
+/// that are kept as they are.
 fn plan_cuts(views: &[DeclaredView], probed: &mut [Result<Probed, Skipped>], lenses: Lenses) {
     let mut distinct: Vec<Intrinsics> = Vec::new();
     for view in probed.iter().flatten() {
@@ -257,7 +259,7 @@ fn plan_cuts(views: &[DeclaredView], probed: &mut [Result<Probed, Skipped>], len
     }
 }
 
-/// What becomes of the photographs of a distorted camera.
+/// How the photographs of a distorted camera are used.
 enum Plan {
     Cut(Cut),
     Stays(Option<Shown>),
@@ -271,7 +273,7 @@ fn usable_bounds([near, far]: [f64; 2]) -> Option<[f32; 2]> {
     (bounds[0] > 0.0 && bounds[1] > bounds[0] && bounds[1].is_finite()).then_some(bounds)
 }
 
-/// The warning about photographs of another shape than their cameras, whose focal lengths are stretched with the picture.
+/// The warning about photographs whose aspect ratio is not their camera's; its focal lengths are stretched with the image.
 fn stretched_warning(usable: &[(DeclaredView, Probed)]) -> Option<String> {
     let is_stretched = |(view, probed): &&(DeclaredView, Probed)| {
         let (width, height) = (f64::from(probed.source.width), f64::from(probed.source.height));
@@ -283,8 +285,8 @@ fn stretched_warning(usable: &[(DeclaredView, Probed)]) -> Option<String> {
     let [width, height] = view.camera.size?;
     let (count, of) = (1 + stretched.count(), usable.len());
     Some(format!(
-        "{count} of {of} photographs have another shape than their cameras, such as {}, of {}x{} pixels for {width}x{height}: they were cut or turned, or \
-         width and height are exchanged; poses will not fit unless they were stretched",
+        "{count} of {of} photographs do not have the aspect ratio of their cameras, such as {}, of {}x{} pixels for {width}x{height}: they \
+         were cropped or rotated, or width and height are exchanged; poses will not fit unless they were stretched",
         view.name, probed.source.width, probed.source.height
     ))
 }
@@ -316,7 +318,7 @@ fn faces_warning(usable: &[(DeclaredView, Probed)]) -> Option<String> {
     })
 }
 
-/// What turns a declared view into views.
+/// What is needed to turn declared views into views.
 struct Finishing<'a> {
     downscale: f32,
     max_side: Option<u32>,
@@ -335,7 +337,7 @@ impl Finishing<'_> {
                 .filter_map(|(name, plan)| {
                     let mut face = self.view(&view, probed, Some(*plan))?;
                     face.name = format!("{}/{name}", view.name);
-                    // Depths, normals and movement have the axes of the photograph, not of the face.
+                    // Depths, normals and motion are in the axes of the photograph, not of the face.
                     face.depth_bounds = None;
                     face.camera.shutter = None;
                     face.depth_map = None;
@@ -371,7 +373,7 @@ impl Finishing<'_> {
             size: (intrinsics.width, intrinsics.height),
         };
         let map = |path: &Option<PathBuf>| {
-            // Those of a fisheye may be depths along the axis or distances.
+            // Maps of a fisheye may hold depths along the axis or distances.
             path.clone().filter(|_| !intrinsics.lens.is_wide()).map(|path| {
                 Arc::new(MapFile {
                     path,
@@ -428,8 +430,8 @@ pub(crate) fn oriented_size(header: &Header, orientation: Orientation) -> (u32, 
     }
 }
 
-/// The orientation that [`super::read_dataset`] applies to a photograph of a COLMAP model whose camera has the upright size, and where
-/// up is then in the picture, `[right, down]`, if it is not where the picture's y axis has it. Half turns and square pictures are not turned.
+/// The orientation that [`super::read_dataset`] applies to a photograph of a COLMAP model whose camera has the upright size, and the up
+/// direction in the resulting image, `[right, down]`, if that is not its top. Half turns and square images stay as stored.
 pub(crate) fn turned_as_stored(header: &Header) -> (Orientation, Option<[i8; 2]>) {
     use Orientation::{FlipVertical, Rotate90, Rotate90FlipH, Rotate180, Rotate270, Rotate270FlipH};
     let (width, height) = oriented_size(header, header.orientation);

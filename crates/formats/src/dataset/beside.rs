@@ -1,14 +1,14 @@
-//! Files that belong to images, one each, in a folder beside theirs: masks, and maps of depth and of normals.
+//! Files that each belong to one image, in a folder beside that of the images: masks, depth maps and normal maps.
 
 use super::declared::{Declared, DeclaredView};
 use super::files::{is_image_name, relative_name};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
-/// Maximum depth of the search; a link back to a parent would not end.
+/// Maximum depth of the search, which a link back to a parent would otherwise make endless.
 const MAX_DEPTH: u32 = 6;
 
-/// The files in a separate folder, by the image to which they belong.
+/// The files in a separate folder, by the image that they belong to.
 pub struct Beside {
     folder: String,
     /// By path below the folder, lower case, without extension.
@@ -24,13 +24,13 @@ impl Beside {
         Self::find(root, &names, is_image_name)
     }
 
-    /// The maps of depth below `root`: in `depths`, as the authors' code of 3DGS expects them, or in `depth`.
+    /// The depth maps below `root`: in `depths`, as the authors' code of 3DGS expects them, or in `depth`.
     pub fn depths(root: &Path) -> Option<Self> {
         let is_map = |path: &Path| is_image_name(path) || path.extension().is_some_and(|e| e == "npy");
         Self::find(root, &["depths".to_owned(), "depth".to_owned()], is_map)
     }
 
-    /// The maps of normals below `root`: in `normals` or in `normal`.
+    /// The normal maps below `root`: in `normals` or in `normal`.
     pub fn normals(root: &Path) -> Option<Self> {
         Self::find(root, &["normals".to_owned(), "normal".to_owned()], is_image_name)
     }
@@ -77,7 +77,7 @@ impl Beside {
     }
 }
 
-/// Gives views without masks those that lie in `masks` below the dataset's folder.
+/// Gives views without a mask theirs in `masks` below the dataset's folder, if there is one.
 pub(super) fn find_masks(declared: &mut Declared) {
     let Some(masks) = Beside::masks(&declared.root, "images") else {
         return;
@@ -90,7 +90,7 @@ pub(super) fn find_masks(declared: &mut Declared) {
     declared.warnings.extend(warning);
 }
 
-/// Gives views the maps of depth and of normals that lie below the dataset's folder, if its files declare none.
+/// Gives views the depth maps below the dataset's folder if its files declare none, and likewise the normal maps.
 pub(super) fn find_maps(declared: &mut Declared) {
     let depths = Beside::depths(&declared.root).filter(|_| declared.views.iter().all(|view| view.depth.is_none()));
     let normals = Beside::normals(&declared.root).filter(|_| declared.views.iter().all(|view| view.normals.is_none()));

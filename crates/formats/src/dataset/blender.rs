@@ -26,7 +26,7 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
         frames.iter_mut().for_each(|view| view.split = Some(split));
         views.extend(frames);
         if let (None, Some(ply)) = (&points, &transforms.ply_file_path) {
-            match read_declared_points(&root.join(ply)) {
+            match read_declared_points(&root.join(ply.replace('\\', "/"))) {
                 Ok(read) => points = Some(read),
                 Err(error) => warnings.push(format!("the initial points are ignored: {error}")),
             }

@@ -47,7 +47,7 @@ fn begins_as_a_bundle(file: &Path) -> bool {
     super::files::begins_with(file, |start| start.starts_with(b"# Bundle file"))
 }
 
-/// The name in a line of a list, which may have a focal length and other numbers behind it.
+/// The name in a line of a list, which may have a focal length and other numbers after it.
 fn name_in(line: &str) -> &str {
     let mut name = line.trim();
     while let Some((before, last)) = name.rsplit_once(char::is_whitespace)
@@ -111,7 +111,7 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
 /// Parses a `bundle.out`.
 ///
 /// # Errors
-/// When it is another version, truncated, or has a word where a number is expected.
+/// When it is of another version, truncated, or has a word where a number is expected.
 pub fn parse_bundle(bytes: &[u8]) -> Result<Bundle, Malformed> {
     let text = text(bytes)?;
     let body = text

@@ -26,9 +26,9 @@ pub(super) struct DeclaredView {
     /// `None` when no such file exists.
     pub image: Option<PathBuf>,
     pub mask: Option<PathBuf>,
-    /// A map of depths.
+    /// The depth map.
     pub depth: Option<PathBuf>,
-    /// A map of normals.
+    /// The normal map.
     pub normals: Option<PathBuf>,
     /// `None` when the numbers do not form a pose.
     pub pose: Option<DeclaredPose>,
@@ -45,7 +45,7 @@ pub(super) struct DeclaredView {
 }
 
 impl DeclaredView {
-    /// A view below `root` of which only these are declared; `name` is used where there is no image.
+    /// A view of which only these values are declared; its name is the image's path below `root`, or `name` if there is no image.
     pub fn posed(
         root: &Path,
         name: &str,
@@ -55,7 +55,7 @@ impl DeclaredView {
     ) -> Self {
         let name = relative_name(root, image.as_deref().unwrap_or(Path::new(name)));
         Self {
-            // Photographs may be beside the folder of the file.
+            // Photographs may lie in a folder beside `root`.
             name: name.trim_start_matches("../").to_owned(),
             image,
             mask: None,
@@ -104,7 +104,7 @@ impl DeclaredPose {
 /// Coloured points in the files' own coordinates.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct DeclaredPoints {
-    /// `[N]`, representable in `f32` but not exactly.
+    /// `[N]`, finite in `f32` but not exactly representable.
     pub positions: Vec<DVec3>,
     /// `[N]` sRGB, 8 bits.
     pub colors: Vec<[u8; 3]>,
@@ -156,12 +156,12 @@ pub(super) enum Focal {
     Pixels([f64; 2]),
     /// Horizontal and vertical field of view, radians; square pixels if one is `None`.
     Angles([Option<f64>; 2]),
-    /// That of a panorama, a whole turn wide and half a turn high.
+    /// Of a panorama: a full turn wide and half a turn high.
     Panorama,
 }
 
 impl DeclaredCamera {
-    /// That of equirectangular panoramas.
+    /// The camera of equirectangular panoramas.
     pub fn panorama() -> Self {
         Self {
             size: None,

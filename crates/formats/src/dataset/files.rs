@@ -76,7 +76,7 @@ pub(super) struct ImageFolder {
     pub warning: Option<String>,
 }
 
-/// `images_N` if the downscale is N and it exists; else the largest there is: `images`, then `images_2`, ..
+/// `images_N` if the downscale is N and it exists; else the largest available: `images`, then `images_2`, ..
 pub(super) fn choose_image_folder(root: &Path, downscale: f32) -> Option<ImageFolder> {
     if downscale > 1.0 && downscale.fract() == 0.0 {
         let name = format!("images_{downscale}");
@@ -111,7 +111,7 @@ pub(super) fn choose_image_folder(root: &Path, downscale: f32) -> Option<ImageFo
     })
 }
 
-/// The photograph `name` of a dataset in one of `folders` below `root`, with its folders or without.
+/// The photograph `name` of a dataset in one of `folders` below `root`: by its path, or by its file name alone.
 pub(super) fn locate_image(root: &Path, folders: &[&str], name: &str) -> Option<PathBuf> {
     let file = Path::new(name).file_name()?;
     let below = |name: &Path| {

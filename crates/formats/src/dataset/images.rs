@@ -1,15 +1,15 @@
-//! Photographs in a folder that the user names, instead of where the layout has them.
+//! Photographs in a folder that the user names, instead of where the layout expects them.
 
 use super::declared::Declared;
 use super::files::find_image;
 use crate::FormatError;
 use std::path::Path;
 
-/// Takes the photographs of `declared` from `folder`: by their paths, without the first folder of these (`images/a/b.jpg` is `a/b.jpg`
-/// there), or by their names alone. `downscale` is relative to these photographs.
+/// Takes the photographs of `declared` from `folder`: by path, by path without its first folder (`a/b.jpg` for `images/a/b.jpg`), or by
+/// file name alone. `downscale` is relative to these photographs.
 ///
 /// # Errors
-/// When none is there.
+/// When none of them is found.
 pub(super) fn relocate(declared: &mut Declared, folder: &Path, downscale: f32) -> Result<(), FormatError> {
     for view in &mut declared.views {
         let name = Path::new(&view.name);

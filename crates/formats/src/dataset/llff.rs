@@ -69,7 +69,7 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
         return Err(FormatError::malformed(
             &file,
             format!(
-                "has {} poses and `{}` has {} images; they belong together by the order of names, so add or remove what \
+                "has {} poses and `{}` has {} images; they are matched in the order of names, so add or remove what \
                  differs",
                 poses.len(),
                 folder.name,

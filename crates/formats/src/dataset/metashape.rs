@@ -22,7 +22,7 @@ pub(super) fn find(path: &Path) -> Option<PathBuf> {
 }
 
 pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError> {
-    let file = find(path).ok_or_else(|| FormatError::malformed(path, "contains no cameras by Metashape"))?;
+    let file = find(path).ok_or_else(|| FormatError::malformed(path, "contains no Metashape cameras"))?;
     let cameras = read_and_parse(&file, parse_metashape)?;
     let root = file.parent().unwrap_or(Path::new(".")).to_owned();
     let (posed, unposed): (Vec<_>, Vec<_>) = cameras.into_iter().partition(|camera| camera.pose.is_some());
@@ -133,7 +133,7 @@ fn pose(matrix: &[f64], world: Option<&Transform>) -> Option<DeclaredPose> {
     pose_from_axes(turn * right, turn * down, turn * forward, position)
 }
 
-/// `None` if it is incomplete: the chunk has no place in the world yet.
+/// `None` if it is incomplete: the chunk has not been placed in the world yet.
 fn transform(element: &Element) -> Option<Transform> {
     let numbers = |name: &str| element.child(name).map(Element::numbers);
     let rotation: [f64; 9] = numbers("rotation")?.try_into().ok()?;
@@ -181,7 +181,7 @@ fn intrinsics(sensor: &Element, calibration: &Element) -> Result<DeclaredCamera,
             )));
         }
     };
-    // Old versions write fx and fy, and the principal point from the corner.
+    // Old versions write fx and fy, and measure the principal point from the corner.
     let (focal, center) = match (number("f"), number("fx")) {
         (Some(f), _) => ([f + of("b1"), f], [0.5 * width + of("cx"), 0.5 * height + of("cy")]),
         (None, Some(fx)) => (

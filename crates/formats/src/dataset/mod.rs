@@ -77,8 +77,8 @@ pub enum DatasetFormat {
 impl DatasetFormat {
     /// All of them, in the order in which a folder is tested.
     ///
-    /// Later preparation takes precedence: `transforms.json` is made from a COLMAP model that may be beside it, and
-    /// `poses_bounds.npy` contains less than the COLMAP model it is made from.
+    /// The layout that was prepared last takes precedence: `transforms.json` is made from a COLMAP model that may be beside it. But
+    /// `poses_bounds.npy` comes last, since it contains less than the COLMAP model that it is made from.
     pub const ALL: [Self; 12] = [
         Self::Blender,
         Self::Nerfstudio,
@@ -184,19 +184,20 @@ pub struct DatasetOptions {
     pub max_side: Option<u32>,
     /// Which views are held out.
     pub holdout: Holdout,
-    /// The folder of the photographs, if it is not where the layout has it.
+    /// The folder of the photographs, if it is not where the layout expects it.
     pub images: Option<PathBuf>,
-    /// What becomes of distorted photographs.
+    /// How distorted photographs are used.
     pub lenses: Lenses,
-    /// Of the film of which the photographs are frames; how the camera moved follows from the poses of their neighbours.
+    /// The rolling shutter of the film whose frames the photographs are; the camera's motion follows from the poses of neighbouring frames.
     pub readout: Option<Readout>,
 }
 
-/// What becomes of photographs by lenses that are no pinholes. Where they keep their distortion, [`irradia_scene::Intrinsics::lens`] has the lens.
+/// How photographs by lenses that are not pinholes are used. If they keep their distortion, [`irradia_scene::Intrinsics::lens`] is the
+/// lens.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Lenses {
-    /// Each is undistorted, or cut into the faces of a cube where one pinhole image would show too little of it.
+    /// Each is undistorted, or cut into the faces of a cube if one pinhole image would show too little of it.
     #[default]
     Undistorted,
     /// Those that would be cut into faces keep their distortion, the others are undistorted.
@@ -320,14 +321,14 @@ pub fn read_dataset(path: &Path, options: &DatasetOptions) -> Result<Dataset, Fo
     if let Some(folder) = &options.images {
         images::relocate(&mut declared, folder, options.downscale)?;
     }
-    // The others' lie beside one of several folders of photographs, or are none.
+    // COLMAP and LLFF have searched masks beside the folder of photographs that they chose; Blender scenes have none.
     if !matches!(
         format,
         DatasetFormat::Colmap | DatasetFormat::Llff | DatasetFormat::Blender
     ) {
         beside::find_masks(&mut declared);
     }
-    // Those of rendered scenes are the truth to compare with.
+    // Maps of rendered scenes are ground truth for comparisons, not input.
     match format {
         DatasetFormat::Blender => {
             for view in &mut declared.views {

@@ -13,7 +13,7 @@ use serde::Deserialize;
 use std::collections::{HashMap, HashSet};
 use std::path::Path;
 
-/// Folders of photographs by the factor by which they are smaller.
+/// Downscale factors of the folders of photographs.
 const SIZES: [u32; 5] = [1, 2, 4, 8, 16];
 
 /// `dataset.json`.
@@ -93,7 +93,7 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
     let [train, held_out] = [&dataset.train_ids, &dataset.val_ids].map(|ids| ids.iter().collect::<HashSet<_>>());
     let mut views = Vec::with_capacity(dataset.ids.len());
     for id in &dataset.ids {
-        // An id is a file name; one that leads elsewhere is none.
+        // An id is a file name, and must not lead to another folder.
         if id.contains(['/', '\\']) {
             return Err(FormatError::malformed(
                 &path.join("dataset.json"),
@@ -135,7 +135,7 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
 }
 
 fn json<T: for<'a> Deserialize<'a>>(bytes: &[u8], what: &str) -> Result<T, Malformed> {
-    serde_json::from_slice(bytes).map_err(|error| Malformed(format!("not usable {what} of Nerfies: {error}")))
+    serde_json::from_slice(bytes).map_err(|error| Malformed(format!("not a usable {what} file of Nerfies: {error}")))
 }
 
 /// Parses `dataset.json`.
@@ -143,7 +143,7 @@ fn json<T: for<'a> Deserialize<'a>>(bytes: &[u8], what: &str) -> Result<T, Malfo
 /// # Errors
 /// When it is not JSON with `ids`.
 pub fn parse_nerfies_dataset(bytes: &[u8]) -> Result<NerfiesDataset, Malformed> {
-    json(bytes, "lists")
+    json(bytes, "dataset")
 }
 
 /// Parses a file of `camera`.

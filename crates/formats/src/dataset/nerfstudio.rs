@@ -9,7 +9,7 @@ use crate::points_ply::read_declared_points;
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
-/// Files of other programs, which may be named themselves.
+/// JSON files of other layouts, which can be given by their path as well.
 const OF_OTHERS: [&str; 3] = ["reconstruction.json", "metadata.json", "dataset.json"];
 
 /// The JSON file: `path` itself, or `transforms.json` in it.
@@ -59,21 +59,21 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
     })
 }
 
-/// Warnings about masks and maps that frames name and that their views, in the same order, do not have, since they are not there.
+/// Warnings about masks and maps that frames name but that do not exist; `views` are in the order of `frames`.
 fn missing_files(frames: &[Frame], views: &[DeclaredView]) -> Vec<String> {
     type Named = fn(&Frame) -> &Option<String>;
     type Found = fn(&DeclaredView) -> &Option<PathBuf>;
     let kinds: [(&str, Named, Found); 3] = [
         ("masks", |frame| &frame.mask_path, |view| &view.mask),
-        ("maps of depth", Frame::depth, |view| &view.depth),
-        ("maps of normals", Frame::normals, |view| &view.normals),
+        ("depth maps", Frame::depth, |view| &view.depth),
+        ("normal maps", Frame::normals, |view| &view.normals),
     ];
     let line = |(what, named, found): (&str, Named, Found)| {
         let lacks = |(frame, view)| named(frame).as_ref().filter(|_| found(view).is_none());
         let missing: Vec<&String> = frames.iter().zip(views).filter_map(lacks).collect();
         let first = missing.first()?;
         Some(format!(
-            "{} {what} are not there, such as {first}: their photographs are used without them",
+            "{} {what} are missing, such as {first}: their photographs are used without them",
             missing.len()
         ))
     };
@@ -109,7 +109,7 @@ pub(super) fn declared_views(
             Some(Split::Left)
         }
     };
-    // A file beside the photograph, if it is there.
+    // A file beside the photograph, if it exists.
     let beside = |path: &Option<String>| {
         let path = path.as_ref().map(|path| root.join(path.replace('\\', "/")));
         path.filter(|path| path.is_file())

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 
 /// Where the photographs are, relative to the file.
 const FOLDERS: [&str; 3] = ["", "images", "../images"];
-/// Numbers behind a photograph's name.
+/// Numbers after a photograph's name.
 const NUMBERS: usize = 10;
 
 /// A model: photographs, and points with the photographs that see them.
@@ -36,7 +36,7 @@ pub struct NvmImage {
     pub rotation: [f64; 4],
     /// The camera's centre.
     pub center: [f64; 3],
-    /// r of undistorted = distorted (1 + r |distorted|^2), in units of the focal length.
+    /// r in undistorted = distorted (1 + r |distorted|^2), in units of the focal length.
     pub radial: f64,
 }
 
@@ -83,7 +83,7 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
 /// Parses an `.nvm` file: its models with photographs.
 ///
 /// # Errors
-/// When it is another version, truncated, or has a word where a number is expected.
+/// When it is of another version, truncated, or has a word where a number is expected.
 pub fn parse_nvm(bytes: &[u8]) -> Result<Vec<NvmModel>, Malformed> {
     let text = text(bytes)?;
     let mut lines = text

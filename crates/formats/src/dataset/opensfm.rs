@@ -11,7 +11,7 @@ use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Where OpenSfM and OpenDroneMap leave it.
+/// Where OpenSfM and OpenDroneMap write it.
 const PLACES: [&str; 3] = [
     "reconstruction.json",
     "opensfm/reconstruction.json",
@@ -106,7 +106,7 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
         let camera = part.cameras.get(&shot.camera).ok_or_else(|| {
             FormatError::malformed(
                 &file,
-                format!("{name} is by camera `{}`, which is not there", shot.camera),
+                format!("{name} uses camera `{}`, which is not in the file", shot.camera),
             )
         })?;
         let camera = declared_camera(camera).map_err(|source| FormatError::Malformed {

@@ -1,4 +1,4 @@
-//! Panoramas whose faces were posed by `irradia pose`: where photographs of wide lenses are kept whole, they stand for their faces.
+//! Panoramas whose faces were posed by `irradia pose`: if photographs of wide lenses are kept whole, panoramas replace their faces.
 
 use super::declared::{DeclaredCamera, DeclaredPose, DeclaredView};
 use super::files::relative_name;
@@ -7,9 +7,9 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// The folder, in that of a dataset, of the panoramas, whose faces are named after them: `a_front.jpg` of `a.jpg`.
+/// The folder of the panoramas within that of a dataset; their faces are named after them: `a_front.jpg` for `a.jpg`.
 pub const PANORAMAS: &str = "faces/panoramas";
-/// That of their masks: `a.jpg.png`.
+/// The folder of their masks: `a.jpg.png` for `a.jpg`.
 pub const PANORAMA_MASKS: &str = "faces/panorama_masks";
 
 /// The files of a folder by their name without the extension; none if there is no such folder.
@@ -29,7 +29,7 @@ pub(super) fn join(views: Vec<DeclaredView>, root: &Path) -> Vec<DeclaredView> {
     let mut joined: BTreeMap<&Path, DeclaredView> = BTreeMap::new();
     let mut others = Vec::new();
     for view in views {
-        // A declared split may be one of faces.
+        // A declared split may separate the faces of one panorama.
         let face = view.split.is_none().then(|| face_of(&view, &panoramas)).flatten();
         let Some((panorama, pose)) = face else {
             others.push(view);

@@ -71,7 +71,7 @@ pub(super) fn find_record3d(path: &Path) -> Option<PathBuf> {
 
 pub(super) fn read_polycam(path: &Path, downscale: f32) -> Result<Declared, FormatError> {
     let Some((cameras, images)) = find_polycam(path) else {
-        return Err(FormatError::malformed(path, "contains no keyframes by Polycam"));
+        return Err(FormatError::malformed(path, "contains no Polycam keyframes"));
     };
     let mut views = Vec::new();
     for file in list_files(&cameras, |file| file.extension().is_some_and(|e| e == "json"))? {
@@ -90,7 +90,7 @@ pub(super) fn read_polycam(path: &Path, downscale: f32) -> Result<Declared, Form
 
 pub(super) fn read_record3d(path: &Path, downscale: f32) -> Result<Declared, FormatError> {
     let Some(file) = find_record3d(path) else {
-        return Err(FormatError::malformed(path, "contains no capture by Record3D"));
+        return Err(FormatError::malformed(path, "contains no Record3D capture"));
     };
     let capture = read_and_parse(&file, parse_record3d)?;
     let view = |(i, numbers): (usize, &[f64; 7])| {
@@ -114,7 +114,7 @@ pub(super) fn read_record3d(path: &Path, downscale: f32) -> Result<Declared, For
 /// # Errors
 /// When it is not JSON with these keys.
 pub fn parse_polycam(bytes: &[u8]) -> Result<PolycamCamera, Malformed> {
-    serde_json::from_slice(bytes).map_err(|error| Malformed(format!("not a usable camera by Polycam: {error}")))
+    serde_json::from_slice(bytes).map_err(|error| Malformed(format!("not a usable Polycam camera: {error}")))
 }
 
 /// Parses the `metadata.json` of Record3D.
@@ -122,7 +122,7 @@ pub fn parse_polycam(bytes: &[u8]) -> Result<PolycamCamera, Malformed> {
 /// # Errors
 /// When it is not JSON with these keys.
 pub fn parse_record3d(bytes: &[u8]) -> Result<Record3d, Malformed> {
-    serde_json::from_slice(bytes).map_err(|error| Malformed(format!("not a usable capture by Record3D: {error}")))
+    serde_json::from_slice(bytes).map_err(|error| Malformed(format!("not a usable Record3D capture: {error}")))
 }
 
 impl PolycamCamera {

@@ -1,4 +1,4 @@
-//! How cameras moved while their photographs were read out: as `transforms.json` has it, or by the poses of neighbouring frames of a film.
+//! Motion of cameras while their photographs were read out: from `transforms.json`, or from the poses of neighbouring frames of a film.
 
 use super::declared::{DeclaredPose, DeclaredView};
 use glam::DVec3;
@@ -9,15 +9,15 @@ use std::ops::Bound::{Excluded, Unbounded};
 use std::path::Path;
 use std::str::FromStr;
 
-/// Numbers that are not finite are `None`.
+/// A velocity; numbers that are not finite are `None`.
 pub(super) type Velocity = [Option<f64>; 3];
 
 /// The rolling shutter of a film's camera.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Readout {
-    /// The time from the first row to the last, in frames of the film: 10 ms are 0.3 of a film of 30 frames a second.
+    /// The time from the first row to the last, in frames of the film: at 30 frames per second, 10 ms are 0.3.
     pub frames: f64,
-    /// Where it begins.
+    /// The side at which it begins.
     pub first: FirstSide,
 }
 
@@ -36,14 +36,14 @@ impl FromStr for Readout {
         let frames = frames.filter(|frames| (0.0..=1.0).contains(frames));
         Ok(Self {
             frames: frames
-                .ok_or("expected 0 to 1 frames, such as 0.5, or 0.5:left where the left side is exposed first")?,
+                .ok_or("expected 0 to 1 frames, such as 0.5, or 0.5:left if the left side is exposed first")?,
             first: first.parse()?,
         })
     }
 }
 
-/// The shutter of velocities in OpenGL axes, per second, and a readout in seconds, from top to bottom: the keys of "Gaussian Splatting on the Move".
-/// `None` for a camera at rest, and for one that turns by so much that velocity or time must be of another unit.
+/// The shutter from velocities in OpenGL axes, per second, and the time of a readout from top to bottom, seconds: the keys of "Gaussian
+/// Splatting on the Move". `None` for a camera at rest, and for one that rotates so far that velocity or time must be in another unit.
 pub(super) fn of_velocities(linear: Velocity, angular: Velocity, seconds: f64) -> Option<RollingShutter> {
     let opencv = |[x, y, z]: Velocity| Some((DVec3::new(x?, -y?, -z?) * seconds).as_vec3());
     let (translation, rotation) = (opencv(linear)?, opencv(angular)?);
@@ -57,8 +57,8 @@ pub(super) fn of_velocities(linear: Velocity, angular: Velocity, seconds: f64) -
     })
 }
 
-/// Gives the frames of films, which are numbered by time, shutters by the poses of their neighbours; those that have one keep it, and those
-/// that would turn too far get none. Returns how many views have one.
+/// Gives the frames of films, which are numbered by time, shutters from the poses of their neighbours. Frames that have a shutter keep it,
+/// and frames that would rotate too far get none. Returns how many views have one.
 pub(super) fn of_neighbours(views: &mut [DeclaredView], readout: &Readout) -> usize {
     let mut films: BTreeMap<String, BTreeMap<u64, usize>> = BTreeMap::new();
     for (index, view) in views.iter().enumerate().filter(|(_, view)| view.pose.is_some()) {
@@ -91,7 +91,7 @@ pub(super) fn of_neighbours(views: &mut [DeclaredView], readout: &Readout) -> us
     views.iter().filter(|view| view.shutter.is_some()).count()
 }
 
-/// The way and the turn from `before` to `after`, along and about the axes of `camera`.
+/// Translation and rotation from `before` to `after`, along and about the axes of `camera`.
 fn movement(camera: &DeclaredPose, before: &DeclaredPose, after: &DeclaredPose) -> [DVec3; 2] {
     let turn = before.rotation.inverse() * after.rotation;
     let shorter = if turn.w < 0.0 { -turn } else { turn };
@@ -101,7 +101,7 @@ fn movement(camera: &DeclaredPose, before: &DeclaredPose, after: &DeclaredPose) 
     ]
 }
 
-/// What the names of a film's frames have in common, and the number of this one: the digits at the end of its stem.
+/// The part of a frame's name that its film's frames have in common, and its number: the digits at the end of its stem.
 fn numbered(name: &str) -> Option<(String, u64)> {
     let path = Path::new(name);
     let stem = path.file_stem()?.to_str()?;
@@ -135,7 +135,7 @@ mod tests {
 
     #[test]
     fn frames_move_as_their_neighbours_say() {
-        // Sideways at a unit and about Y at 0.1 radians a frame.
+        // One unit sideways and 0.1 radians about Y per frame.
         let view = |name: &str, time: f64| {
             let pose = DeclaredPose {
                 rotation: DQuat::from_rotation_y(0.1 * time),

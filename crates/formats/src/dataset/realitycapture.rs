@@ -1,9 +1,9 @@
 //! Cameras exported by RealityCapture: a `.csv` of internal and external parameters, or an `.xmp` beside each photograph.
 //!
-//! Focal lengths are those of a film 36 mm wide, which is the longer side of the image. Angles of the CSV, in degrees, turn a camera
-//! that looks along -Z with Y up: roll about Y, pitch about X, then the negative heading about Z (nerfstudio's
+//! Focal lengths are in mm for film 36 mm wide, which corresponds to the longer side of the image. Angles of the CSV, in degrees, rotate
+//! a camera that looks along -Z with Y up: roll about Y, pitch about X, then the negative heading about Z (nerfstudio's
 //! `realitycapture_utils.py`). An XMP has camera-from-world with OpenCV axes. The tangential coefficients t1 and t2 are OpenCV's p2 and
-//! p1, as in the program's own template of an export for OpenCV, and in AliceVision's import.
+//! p1, as in the program's own export template for OpenCV and in AliceVision's importer.
 
 use super::declared::{Declared, DeclaredCamera, DeclaredPose, DeclaredView, Focal, lens_or_pinhole, pose_from_axes};
 use super::files::{begins_with, first_file, is_image_name, list_files, locate_image, relative_name};
@@ -21,7 +21,7 @@ use std::path::{Path, PathBuf};
 const FILM: f64 = 36.0;
 /// Where the photographs are, relative to the file.
 const FOLDERS: [&str; 3] = ["images", "", "../images"];
-/// What an XMP with a pose holds.
+/// Text that only an XMP with a pose contains.
 const POSE: &[u8] = b"xcr:Rotation";
 /// How the CSV begins.
 const FIRST_COLUMNS: &[u8] = b"#name,x,y,alt,heading,pitch,roll";
@@ -45,7 +45,7 @@ pub struct RealityCaptureView {
 pub(super) enum Source {
     /// One table.
     Csv(PathBuf),
-    /// Photographs with a file each.
+    /// Photographs, each with an XMP beside it.
     Xmp(Vec<PathBuf>),
 }
 
@@ -62,7 +62,7 @@ pub(super) fn find(path: &Path) -> Option<Source> {
     if let Some(file) = first_file(path, is_table) {
         return Some(Source::Csv(file));
     }
-    // Others have a calibration alone.
+    // Other XMP files have only a calibration.
     let has_camera = |start: &[u8]| start.windows(POSE.len()).any(|word| word == POSE);
     [path.to_owned(), path.join("images")].into_iter().find_map(|folder| {
         let images = list_files(&folder, is_image_name).ok()?;
@@ -99,7 +99,7 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
             }
             (path.to_owned(), views)
         }
-        None => return Err(FormatError::malformed(path, "contains no cameras by RealityCapture")),
+        None => return Err(FormatError::malformed(path, "contains no RealityCapture cameras")),
     };
     Ok(Declared {
         kind: "RealityCapture",
@@ -134,7 +134,7 @@ fn view(root: &Path, image: Option<PathBuf>, row: RealityCaptureView) -> Declare
 /// Parses the CSV.
 ///
 /// # Errors
-/// When a column is missing, or a number is none.
+/// When a column is missing, or a value is not a number.
 pub fn parse_realitycapture_csv(bytes: &[u8]) -> Result<Vec<RealityCaptureView>, Malformed> {
     let mut lines = text(bytes)?.lines();
     let header: HashMap<&str, usize> = lines
@@ -187,7 +187,7 @@ pub fn parse_realitycapture_csv(bytes: &[u8]) -> Result<Vec<RealityCaptureView>,
 /// Parses an XMP; the name is left empty.
 ///
 /// # Errors
-/// When it has no pose or focal length, or another model of distortion.
+/// When it has no pose or focal length, or a distortion model that is not supported.
 pub fn parse_realitycapture_xmp(bytes: &[u8]) -> Result<RealityCaptureView, Malformed> {
     let document = parse_xml(bytes)?;
     let several = |name: &str| property(&document, name).map(numbers).unwrap_or_default();

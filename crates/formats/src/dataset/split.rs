@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 /// Files that list the held-out and the training images, one name per line.
 const TEST_LISTS: [&str; 2] = ["test_images.txt", "test.txt"];
 const TRAIN_LISTS: [&str; 2] = ["train_images.txt", "train.txt"];
-/// Beside the images, or at the Inria code's location.
+/// Folders of these lists: the dataset's own, and the Inria code's location.
 const FOLDERS: [&str; 2] = ["", "sparse/0"];
 
 /// Selects the views held out of training.
@@ -109,7 +109,7 @@ pub(super) fn split(
         }
     };
     if indices.test.is_empty() && *holdout != Holdout::Nothing {
-        let line = "no view is held out, so that nothing is evaluated; holdout can choose some";
+        let line = "no view is held out, so nothing is evaluated; the option holdout selects some";
         indices.warning.get_or_insert_with(|| line.into());
     }
     Ok(indices)

@@ -3,7 +3,7 @@
 use crate::Malformed;
 use std::str::{FromStr, SplitWhitespace};
 
-/// The words of a text that are not read yet.
+/// The unread words of a text.
 pub(super) struct Tokens<'a> {
     words: SplitWhitespace<'a>,
 }
@@ -22,7 +22,7 @@ impl<'a> Tokens<'a> {
             .next()
             .ok_or_else(|| Malformed(format!("ends where {what} is expected; the file is truncated")))?;
         word.parse()
-            .map_err(|_| Malformed(format!("`{word}` is where {what} is expected")))
+            .map_err(|_| Malformed(format!("`{word}` found where {what} is expected")))
     }
 
     /// The next `N` numbers.

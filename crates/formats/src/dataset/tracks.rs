@@ -7,7 +7,7 @@ use crate::Malformed;
 /// A point: position, sRGB, and the numbers of the photographs that see it.
 pub type TrackPoint = ([f64; 3], [u8; 3], Vec<usize>);
 
-/// Reads a point: position, colour, the number of its views, and four words a view, the first of which is the photograph's number.
+/// Reads a point: position, colour, the number of its views, and four words per view, the first of which is the photograph's number.
 pub(super) fn track_point(tokens: &mut Tokens) -> Result<TrackPoint, Malformed> {
     let position = tokens.numbers("a point")?;
     let color = tokens.numbers::<3>("a colour")?.map(|v| v as u8);
@@ -20,7 +20,7 @@ pub(super) fn track_point(tokens: &mut Tokens) -> Result<TrackPoint, Malformed> 
     Ok((position, color, seen))
 }
 
-/// The points that count, and those that each of `photos` photographs sees.
+/// The usable points, and the indices of those that each of `photos` photographs sees.
 pub(super) fn declared(tracks: &[TrackPoint], photos: usize) -> (DeclaredPoints, Vec<Vec<u32>>) {
     let mut points = DeclaredPoints::default();
     let mut seen = vec![Vec::new(); photos];

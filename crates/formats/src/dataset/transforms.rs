@@ -15,7 +15,7 @@ pub struct Transforms {
     pub camera: CameraKeys,
     /// The photographs.
     pub frames: Vec<Frame>,
-    /// How long the rows of a photograph are exposed one after another, seconds.
+    /// Readout time of a rolling shutter, from the first row to the last, seconds.
     pub rolling_shutter_time: Option<f64>,
     /// A point cloud in the same world, relative to the file.
     pub ply_file_path: Option<String>,
@@ -36,11 +36,11 @@ pub struct Frame {
     pub transform_matrix: Vec<Vec<Option<f64>>>,
     /// The mask, relative to the file; white is kept.
     pub mask_path: Option<String>,
-    /// A map of depths, relative to the file.
+    /// The depth map, relative to the file.
     pub depth_file_path: Option<String>,
-    /// The same in files for instant-ngp.
+    /// The same, as named in files for instant-ngp.
     pub depth_path: Option<String>,
-    /// A map of normals, relative to the file.
+    /// The normal map, relative to the file.
     pub normal_file_path: Option<String>,
     /// The same under another name.
     pub normal_path: Option<String>,
@@ -56,12 +56,12 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// The map of depths, under either name.
+    /// The depth map, under either name.
     pub fn depth(&self) -> &Option<String> {
         either(&self.depth_file_path, &self.depth_path)
     }
 
-    /// The map of normals, under either name.
+    /// The normal map, under either name.
     pub fn normals(&self) -> &Option<String> {
         either(&self.normal_file_path, &self.normal_path)
     }
@@ -139,7 +139,7 @@ fn nulls_for_python_numbers(bytes: &[u8]) -> Vec<u8> {
 impl CameraKeys {
     /// These keys, and `others` for missing ones.
     ///
-    /// Focal lengths of a frame and global ones of another kind are not mixed.
+    /// A frame's focal lengths and global ones of another kind are not mixed.
     pub(super) fn or(&self, others: &Self) -> Self {
         let own_focal = self
             .fl_x
@@ -170,9 +170,9 @@ impl CameraKeys {
 
     /// The camera. Focal lengths in pixels take precedence over angles; a missing principal point is at the image's centre.
     ///
-    /// Coefficients: `k1 k2 p1 p2` are OpenCV's, `k3` is its third radial one. A `k4` belongs to the fisheye model; with
-    /// others, nerfstudio's files have it as a fourth radial coefficient that nerfstudio's undistortion rejects unless it is
-    /// zero, and so does this.
+    /// Coefficients: `k1 k2 p1 p2` are OpenCV's, `k3` is its third radial one. A `k4` belongs to the fisheye model; for other
+    /// models, it is a fourth radial coefficient in nerfstudio's files, which nerfstudio's undistortion rejects unless it is zero,
+    /// as does this function.
     pub(super) fn camera(&self) -> Result<DeclaredCamera, Malformed> {
         if self.camera_model.as_deref() == Some("EQUIRECTANGULAR") {
             return Ok(DeclaredCamera::panorama());

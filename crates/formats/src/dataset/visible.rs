@@ -1,21 +1,22 @@
-//! Which points each view sees, for datasets that have points and do not say: a point that is hidden by others is not seen.
+//! Which points each view sees, for datasets that have points but do not declare it: a point that is hidden by others is not seen.
 //!
-//! Points are too sparse for a picture of what they hide. Each view has a coarse grid; a point counts as seen if it is hardly farther than the
-//! nearest point in its cell and in those around it. It suits points on surfaces, most of which are then seen by several views; where they are not, as
-//! with random points in a volume, nothing is known.
+//! Points are too sparse to render what they hide. Each view has a coarse grid instead; a point counts as seen if it is hardly farther
+//! than the nearest point in its cell and the cells around it. This suits points on surfaces, most of which are then seen by several
+//! views. If they are not, as with random points in a volume, no view gets any points.
 
 use irradia_scene::{PointCloud, View};
 use rayon::prelude::*;
 
-/// Cells of the grid along the longer side of a view: at a thousand points in view, one in each.
+/// Cells of the grid along the longer side of a view: about one point per cell for a thousand points in view.
 const CELLS: f32 = 40.0;
-/// Depth relative to the nearest point around it up to which a point is seen.
+/// Maximum depth of a point that is seen, relative to the nearest point around it.
 const BEHIND: f32 = 1.1;
-/// Views that must see a point, and the share of the points that must be seen by so many. Of scenes by `synth` with their true depths: room 0.92 (96 % of
-/// what is found is seen), shelf 0.82 (94 %), thin 0.73 (86 %: its depths cost 0.9 dB), outdoor 0.63; fox and lund_door 0.98.
+/// Minimum number of views that see a point, and minimum fraction of the points that so many views see. Fractions in scenes by `synth`,
+/// compared with their true depths: room 0.92 (96 % of the points found are truly seen), shelf 0.82 (94 %), thin 0.73 (86 %: its depths
+/// cost 0.9 dB), outdoor 0.63; in fox and lund_door 0.98.
 const WITNESSES: u32 = 3;
 const SEEN: f64 = 0.8;
-/// Points that are enough: of more, some are left out, evenly spaced in their order.
+/// Number of points that is enough: if there are more, an evenly spaced subset is used.
 const ENOUGH: usize = 50_000;
 
 /// Sets the points that `views` see, if no view has any.
@@ -38,13 +39,13 @@ pub(super) fn find_points_seen(views: &mut [View], points: Option<&PointCloud>) 
     }
 }
 
-/// The points in `view` that no other hides, of one in `every`.
+/// The points in `view` that no other point hides, of every `every`-th point.
 fn seen_by(view: &View, points: &PointCloud, every: usize) -> Vec<u32> {
     let k = &view.camera.intrinsics;
     let side = k.width.max(k.height) as f32 / CELLS;
     let [columns, rows] = [k.width, k.height].map(|length| (length as f32 / side) as usize + 1);
     let mut inside = Vec::new();
-    // With a rim, so that each cell has eight around it.
+    // With a border, so that each cell has eight neighbours.
     let stride = columns + 2;
     let mut nearest = vec![f32::INFINITY; stride * (rows + 2)];
     for (i, position) in points.positions.iter().enumerate().step_by(every) {
@@ -102,7 +103,7 @@ mod tests {
         }
     }
 
-    /// Points of a wall at depth `z`, `side` to each side.
+    /// Points of a wall at depth `z` that extends by `side` in each direction.
     fn wall(z: f32, side: f32) -> impl Iterator<Item = Vec3> {
         let at = move |i: i32| (i as f32 - 29.5) / 29.5 * side;
         (0..3600).map(move |i| Vec3::new(at(i % 60), at(i / 60), z))
@@ -118,7 +119,7 @@ mod tests {
             let before = view.points_seen.iter().filter(|point| front.contains(point)).count();
             assert_eq!(before, 3600, "the wall before");
             let behind = view.points_seen.iter().filter(|point| !front.contains(point));
-            // Seen beside the one before, and not through it but at its rim.
+            // Seen beside the wall in front, and not through it except at its border.
             let through = |point: &&u32| {
                 let at = points.positions[**point as usize] - view.camera.pose.position;
                 let hidden = (points.positions[0].x - view.camera.pose.position.x)..(0.5 - view.camera.pose.position.x);
@@ -126,7 +127,7 @@ mod tests {
             };
             assert!(behind.clone().count() > 1000 && behind.filter(through).count() == 0);
         }
-        // What a dataset says is not replaced.
+        // What a dataset declares is not replaced.
         let mut told = views();
         told[0].points_seen = vec![7];
         find_points_seen(&mut told, Some(&points));

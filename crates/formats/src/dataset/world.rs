@@ -3,17 +3,17 @@
 use glam::DVec3;
 use irradia_scene::Similarity;
 
-/// Distance of the cameras' median from the origin, in median distances of a camera from it, above which the origin is moved
-/// there. Neighbouring `f32` values are then up to 1e-5 of that distance apart: a hundredth of a pixel of most photographs.
+/// Distance of the cameras' median from the origin above which the origin is moved there, in units of the median distance of a camera
+/// from that median. At this limit, neighbouring `f32` values are up to 1e-5 of these units apart: a hundredth of a pixel in most
+/// photographs.
 const FARTHEST: f64 = 100.0;
-/// Median distances of a camera from the cameras' median, in units of the files, between which units are kept: from a hand-held
-/// close-up to a building, both in metres, in the arbitrary units of structure from motion as well.
+/// Range of the median distance of a camera from the cameras' median, in the files' unit, in which that unit is kept: from a hand-held
+/// close-up to a building, both in metres. It also covers the arbitrary units of structure from motion.
 const USUAL: [f64; 2] = [0.1, 50.0];
 
-/// The world of cameras at `positions`. Its origin is the cameras' median if that is far from the files' origin. Its unit is a
-/// power of ten of theirs, such that half of the cameras are within 1 to 10 units of the median, if they are not within
-/// [`USUAL`]; what is measured in world units, like the near plane, then follows the scene's size. Medians, since one
-/// camera may be placed anywhere.
+/// The world of cameras at `positions`. Its origin is the cameras' median if that is far from the files' origin. If the median distance
+/// of a camera from there is not within [`USUAL`], the unit is a power of ten of the files', such that this distance is 1 to 10 units;
+/// constants in world units, like the near plane, then follow the scene's size. Medians, since one camera may be misplaced.
 pub(super) fn world_from_dataset(positions: &[DVec3]) -> Similarity {
     let along = |axis: usize| median(positions.iter().map(|p| p[axis]).collect());
     let center = DVec3::new(along(0), along(1), along(2));

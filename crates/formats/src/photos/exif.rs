@@ -1,11 +1,11 @@
-//! What a camera wrote into its photograph: EXIF 2.32 (CIPA DC-008).
+//! What a camera wrote into a photograph: EXIF 2.32 (CIPA DC-008).
 
 use exif::{Exif, In, Reader, Tag, Value};
 
 /// Width of a frame of 35 mm film, to which equivalent focal lengths refer.
 const FILM_WIDTH_MM: f64 = 36.0;
 
-/// The tags that tell something about the camera.
+/// The tags that describe the camera, and when and where the photograph was taken.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct CameraTags {
     /// Manufacturer.
@@ -20,7 +20,7 @@ pub struct CameraTags {
     pub gps: Option<[f64; 3]>,
 }
 
-/// The tags of an EXIF block, which begins with the TIFF header; what is absent or damaged is `None`. `size` is that of the stored
+/// The tags of an EXIF block, which begins with the TIFF header; absent or damaged tags are `None`. `size` is the size of the stored
 /// pixels.
 pub fn parse_camera_tags(block: &[u8], size: [u32; 2]) -> CameraTags {
     let Ok(exif) = Reader::new().read_raw(block.to_vec()) else {
@@ -49,7 +49,7 @@ fn number(exif: &Exif, tag: Tag) -> Option<f64> {
     numbers(exif, tag)?.first().copied()
 }
 
-/// Finite numbers of any type.
+/// The numbers of a tag of any numeric type; `None` if one is not finite.
 fn numbers(exif: &Exif, tag: Tag) -> Option<Vec<f64>> {
     let value = &exif.get_field(tag, In::PRIMARY)?.value;
     let numbers: Vec<f64> = match value {
@@ -59,7 +59,7 @@ fn numbers(exif: &Exif, tag: Tag) -> Option<Vec<f64>> {
     numbers.iter().all(|number| number.is_finite()).then_some(numbers)
 }
 
-/// From the focal length in terms of 35 mm film, or in millimetres and the density of the sensor's pixels.
+/// From the 35 mm equivalent focal length, or from the focal length in millimetres and the density of the sensor's pixels.
 fn focal(exif: &Exif, size: [u32; 2]) -> Option<f64> {
     let film = number(exif, Tag::FocalLengthIn35mmFilm).filter(|mm| *mm > 0.0);
     if let Some(mm) = film {
@@ -100,7 +100,7 @@ fn gps(exif: &Exif) -> Option<[f64; 3]> {
     let latitude = angle(Tag::GPSLatitude, Tag::GPSLatitudeRef, "S").filter(|v| v.abs() <= 90.0)?;
     let longitude = angle(Tag::GPSLongitude, Tag::GPSLongitudeRef, "W").filter(|v| v.abs() <= 180.0)?;
     if latitude == 0.0 && longitude == 0.0 {
-        // In the sea: some cameras write it before they know their place.
+        // A place in the sea, which some cameras write before they know their position.
         return None;
     }
     let below = number(exif, Tag::GPSAltitudeRef) == Some(1.0);
@@ -141,7 +141,7 @@ mod tests {
             (Tag::FocalLength, ratio(4, 1)),
         ]);
         assert_eq!(parse_camera_tags(&film, [4000, 3000]).focal, Some(0.75));
-        // 6 mm on a sensor of 200 pixels a millimetre, 4000 wide: 20 mm; the file was halved since.
+        // 6 mm on a sensor of 200 pixels per millimetre, 4000 wide: 20 mm; the file was halved afterwards.
         let sensor = block(&[
             (Tag::FocalLength, ratio(6, 1)),
             (Tag::FocalPlaneXResolution, ratio(2000, 1)),

@@ -1,10 +1,10 @@
-//! Which way is up, from what a drone writes of its gimbal into its photographs.
+//! The up direction, from the angles of its gimbal that a drone writes into its photographs.
 
 use crate::xml::{parse_xml, property};
 use glam::DVec3;
 
-/// The direction up in the axes of the stored picture (x right, y down, z forward), from the pitch and roll that cameras by DJI write into
-/// their photographs' XMP: degrees, pitch 0 level and -90 straight down. `None` where they are absent or damaged.
+/// The up direction in the axes of the stored image (x right, y down, z forward), from the pitch and roll that cameras by DJI write into
+/// their photographs' XMP: degrees, pitch 0 for level and -90 for straight down. `None` if they are absent or damaged.
 pub fn parse_gimbal(xmp: &[u8]) -> Option<DVec3> {
     let document = parse_xml(xmp).ok()?;
     let angle = |name: &str| {
@@ -36,11 +36,11 @@ mod tests {
             assert!((up - DVec3::from(expected)).length() < 1e-9, "{angles:?}: {up}");
         };
         near(["+0.00", "+0.00"], [0.0, -1.0, 0.0]);
-        // Straight down, what is forward is down.
+        // Straight down: forward is down.
         near(["-90.00", "+0.00"], [0.0, 0.0, -1.0]);
-        // Rolled to the right, up is to the picture's left.
+        // Rolled to the right: up is to the image's left.
         near(["0", "90"], [-1.0, 0.0, 0.0]);
-        // Past straight down is the same as before it, turned by half a turn.
+        // Tilted past straight down is the same as before it, rotated by half a turn.
         near(["-60", "180"], [0.0, 0.5, -0.75f64.sqrt()]);
     }
 

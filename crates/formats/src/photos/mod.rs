@@ -1,4 +1,4 @@
-//! A folder of photographs without poses: which there are, and what took them.
+//! Folders of photographs without poses: which photographs there are, and which camera took them.
 
 mod exif;
 mod gimbal;
@@ -18,7 +18,7 @@ use rayon::prelude::*;
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
-/// Extensions of pictures that are not read: of cameras' raw files, and others.
+/// Extensions of image files that are not supported: cameras' raw files, and others.
 const UNREAD: [&str; 15] = [
     "dng", "cr2", "cr3", "nef", "arw", "orf", "rw2", "raf", "srw", "pef", "avif", "jxl", "bmp", "gif", "jp2",
 ];
@@ -36,16 +36,16 @@ pub struct PhotoEntry {
     pub height: u32,
     /// What the camera wrote.
     pub tags: CameraTags,
-    /// Of the bytes of the file, and of its mask.
+    /// Hash of the bytes of the file and of its mask.
     pub hash: u64,
-    /// Its mask, in the folder `masks`: what is black there is not looked at.
+    /// Its mask, in the folder `masks`; pixels that are black in it are ignored.
     pub mask: Option<PathBuf>,
-    /// Its map of depths, in the folder `depths` or `depth`.
+    /// Its depth map, in the folder `depths` or `depth`.
     pub depth: Option<PathBuf>,
-    /// Its map of normals, in the folder `normals` or `normal`.
+    /// Its normal map, in the folder `normals` or `normal`.
     pub normals: Option<PathBuf>,
-    /// Where up is in the axes of the decoded picture (x right, y down, z forward), a unit vector, if metadata tell: by a drone's gimbal, or by an EXIF
-    /// orientation against which the picture is decoded as stored.
+    /// The up direction in the axes of the decoded image (x right, y down, z forward), a unit vector, if the metadata give it: by a
+    /// drone's gimbal, or by an EXIF orientation that is not applied because the image is decoded as stored.
     pub up: Option<DVec3>,
     orientation: Orientation,
     jpeg: bool,
@@ -57,8 +57,8 @@ impl PhotoEntry {
         Some(self.tags.focal? * f64::from(self.width.max(self.height)))
     }
 
-    /// The pixels, with 3 or 4 channels; a large JPEG at a half, quarter or eighth of its size, but with a longer side of at least
-    /// `side` pixels.
+    /// The pixels, with 3 or 4 channels; a large JPEG is decoded at a half, quarter or eighth of its size if its longer side still has
+    /// at least `side` pixels.
     ///
     /// # Errors
     /// When the file cannot be read or decoded.
@@ -73,7 +73,7 @@ impl PhotoEntry {
         }
     }
 
-    /// The same photograph, which has no mask, with the one in the file `mask`.
+    /// The same photograph, which must have no mask, with the mask in the file `mask`.
     ///
     /// # Errors
     /// When the file cannot be read.
@@ -100,7 +100,7 @@ impl PhotoEntry {
         })
     }
 
-    /// The mask at `width` x `height`, 0 where the photograph does not count; `None` if it has none.
+    /// The mask at `width` x `height`, 0 where the photograph is ignored; `None` if it has none.
     ///
     /// # Errors
     /// When the file cannot be read or decoded.
@@ -122,10 +122,10 @@ impl PhotoEntry {
 pub struct PhotoFolder {
     /// Sorted by name; no two have the same bytes.
     pub photos: Vec<PhotoEntry>,
-    /// Names of the other pictures, and why they are not used.
+    /// Names of the other image files, and why they are not used.
     pub left_out: Vec<(String, String)>,
-    /// Names of files that show what a photograph shows already, such as copies, cameras' raw files beside their JPEG and a HEIC beside the JPEG
-    /// made of it, and what they are: nothing is lost with them.
+    /// Names of files that are left out without loss, and why: copies, cameras' raw files beside their JPEG, one of a HEIC and the JPEG
+    /// made from it, and folders of masks that fit no photograph.
     pub repeated: Vec<(String, String)>,
 }
 
@@ -135,7 +135,7 @@ impl PhotoFolder {
         self.left_out.iter().chain(&self.repeated)
     }
 
-    /// The number of each photograph's group: those of a group have the same make, model, focal length and size.
+    /// The index of each photograph's group: photographs of a group have the same make, model, focal length and size.
     pub fn groups(&self) -> Vec<usize> {
         let mut known = Vec::new();
         let group = |photo: &PhotoEntry| {
@@ -155,9 +155,9 @@ impl PhotoFolder {
     }
 }
 
-/// The photographs in `folder` itself, or in its folder `images` or, without one, the first of `images_2`, `images_4` and so on that has some, with their masks in
-/// `masks` or `masks_4` beside them. Hidden files and those that are not pictures by their extension
-/// are ignored; pictures that cannot be read are left out, and so is what repeats another.
+/// The photographs in `folder` itself, or else in the first of its subfolders `images`, `images_1`, `images_2`, `images_4` and
+/// `images_8` that has some, with their masks in `masks` (for `images_4` also `masks_4`) beside them. Hidden files and files without
+/// an image's extension are ignored; image files that cannot be read, and those that repeat another, are left out.
 ///
 /// # Errors
 /// When the folder cannot be read.
@@ -165,7 +165,8 @@ pub fn read_photo_folder(folder: &Path) -> Result<PhotoFolder, FormatError> {
     read_photo_folders(&[folder])
 }
 
-/// As [`read_photo_folder`], of several folders: photographs of the same name get that of their folder before it, and of those around it as far as they differ.
+/// Like [`read_photo_folder`], for several folders: photographs of the same name are prefixed with the name of their folder, and with
+/// those of the folders around it until their names differ.
 ///
 /// # Errors
 /// When a folder cannot be read.
@@ -203,7 +204,7 @@ pub fn read_photo_folders(folders: &[impl AsRef<Path>]) -> Result<PhotoFolder, F
             && !here.is_empty()
             && here.iter().all(|file| file.mask.is_none())
         {
-            let why = "none of its files has the name of a photograph, so that nothing is masked";
+            let why = "none of its files has the name of a photograph, so nothing is masked";
             found.repeated.push((masks.folder().to_owned(), why.to_owned()));
         }
     }
@@ -256,7 +257,7 @@ pub fn read_photo_folders(folders: &[impl AsRef<Path>]) -> Result<PhotoFolder, F
     Ok(found)
 }
 
-/// Puts the name of the folder before those of photographs of one name, and of the folders around it where these have one name as well.
+/// Prefixes photographs of the same name with the name of their folder, and of the folders around it if these have the same name as well.
 fn tell_apart(files: &mut [Found]) {
     let mut folders = vec![0; files.len()];
     for _ in 0..MOST_FOLDERS {
@@ -274,28 +275,28 @@ fn tell_apart(files: &mut [Found]) {
     }
 }
 
-/// The pictures that can be read by their extension in the folder `path` or its `images`; none where it is no folder.
+/// The files in the folder `path` or its `images` whose extension is that of a supported image format; none if `path` is not a folder.
 pub fn photo_files(path: &Path) -> Vec<PathBuf> {
     let mut files = pictures_of(path).map_or(Vec::new(), |pictures| pictures.files);
     files.retain(|file| is_image_name(file));
     files
 }
 
-/// Folders by which photographs of one name are told apart.
+/// Maximum number of enclosing folders by which photographs of the same name are distinguished.
 const MOST_FOLDERS: usize = 4;
-/// Folders of photographs below that of a capture: as they are, or at a fraction of their size, as benchmarks have them.
+/// Subfolders of a capture that hold photographs: at full size, or at a fraction of it as in benchmarks.
 const IMAGES: [&str; 5] = ["images", "images_1", "images_2", "images_4", "images_8"];
 
-/// The pictures of a capture.
+/// The image files of a capture.
 struct Pictures {
-    /// The folder beside whose `images` masks and maps lie.
+    /// The folder that holds the masks and maps, beside `images`.
     root: PathBuf,
-    /// The name of the folder of the pictures, `images` if they lie in `root` itself.
+    /// The name of the folder of the files, `images` if they lie in `root` itself.
     images: String,
     files: Vec<PathBuf>,
 }
 
-/// The pictures in `folder` itself, else in the first of its [`IMAGES`] that has some.
+/// The image files in `folder` itself, else in the first of its [`IMAGES`] that has some.
 fn pictures_of(folder: &Path) -> Result<Pictures, FormatError> {
     let files = list_pictures(folder)?;
     let own = folder
@@ -326,22 +327,22 @@ fn pictures_of(folder: &Path) -> Result<Pictures, FormatError> {
     Ok(found)
 }
 
-/// A photograph and what lies beside it, before any of it is opened.
+/// A photograph and the files that belong to it, before any of them is opened.
 struct Found {
     path: PathBuf,
-    /// Among all photographs.
+    /// Its name among all photographs.
     name: String,
     mask: Option<PathBuf>,
     depth: Option<PathBuf>,
     normals: Option<PathBuf>,
 }
 
-/// Pictures by their extension, sorted.
+/// The files with an image's extension, sorted.
 fn list_pictures(folder: &Path) -> Result<Vec<PathBuf>, FormatError> {
     list_files(folder, |path| is_image_name(path) || is_unread(path).is_some())
 }
 
-/// The extension of a kind of picture that is not read.
+/// The file's extension if it is that of an unsupported image format.
 fn is_unread(path: &Path) -> Option<&'static str> {
     let extension = path.extension()?.to_str()?.to_ascii_lowercase();
     UNREAD.into_iter().find(|unread| *unread == extension)
@@ -350,9 +351,9 @@ fn is_unread(path: &Path) -> Option<&'static str> {
 fn read_entry(file: &Found) -> Result<PhotoEntry, String> {
     let (path, mask) = (&file.path, &file.mask);
     if let Some(kind) = is_unread(path) {
-        return Err(format!("{kind} is not read: convert it to JPEG or PNG"));
+        return Err(format!("{kind} is not supported: convert it to JPEG or PNG"));
     }
-    // The folder and the name are known to the reader of the reason.
+    // Without the path, since the reason is shown beside the file's name.
     let reason = |error: FormatError| match error {
         FormatError::Malformed { source, .. } => source.0,
         FormatError::Read { source, .. } => format!("cannot be read: {source}"),
@@ -391,12 +392,12 @@ fn read_entry(file: &Found) -> Result<PhotoEntry, String> {
     })
 }
 
-/// What a mask adds to the hash of its photograph.
+/// The contribution of a mask to the hash of its photograph.
 fn mask_hash(mask: &Path) -> Result<u64, FormatError> {
     Ok(fnv(&read_file(mask)?).rotate_left(1))
 }
 
-/// FNV-1a, 64 bits, of words of 8 bytes: enough to tell files apart, at a byte in a fraction of a nanosecond.
+/// FNV-1a, 64 bits, over words of 8 bytes: enough to tell files apart, in a fraction of a nanosecond per byte.
 fn fnv(bytes: &[u8]) -> u64 {
     let mut hash = 0xcbf2_9ce4_8422_2325u64 ^ bytes.len() as u64;
     let mut add = |word: u64| hash = (hash ^ word).wrapping_mul(0x0100_0000_01b3).rotate_left(29);

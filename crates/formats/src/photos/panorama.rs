@@ -1,4 +1,4 @@
-//! Panoramas of the whole sphere among photographs: recognised by their pixels, and cut into the faces of a cube.
+//! Full-sphere panoramas among photographs: recognised by their metadata or pixels, and cut into the faces of a cube.
 
 use super::PhotoEntry;
 use crate::faces::panorama_faces;
@@ -13,20 +13,22 @@ use std::fs;
 use std::io::{self, Read};
 use std::path::Path;
 
-/// Size of the copy in which a panorama is recognised, px.
+/// Size of the small copy by which a panorama is recognised, px.
 const SMALL: [usize; 2] = [256, 128];
-/// Width below which nothing is a panorama, px: thumbnails.
+/// Minimum width of a panorama, px: smaller images are thumbnails.
 const SMALLEST: u32 = 512;
-/// Difference of the width from twice the height, by the width, at most: some programs miss it by a few pixels (4098 x 2048).
+/// Maximum difference between the width and twice the height, relative to the width: some programs are off by a few pixels (4098 x 2048).
 const ASPECT: f64 = 0.004;
-/// What is written into panoramas by XMP's `GPano:ProjectionType`, and the bytes at the beginning of a file in which it is sought.
+/// The value of XMP's `GPano:ProjectionType` in panoramas, and the number of bytes at the beginning of a file in which it is searched.
 const PROJECTION: &[u8] = b"equirectangular";
 const METADATA: u64 = 1 << 18;
-/// Difference between both ends of a row by that between opposite directions, at most. In 47 panoramas the median is 0.1, in photographs about 1.
+/// Maximum difference between the two ends of a row, relative to that between opposite directions. The median of 47 panoramas is 0.1;
+/// photographs have about 1.
 const SEAM: f64 = 0.25;
-/// Spread of the row of a pole by that of other rows, at most, of the pole where it is less.
+/// Maximum spread of a pole's row relative to the mean of all rows, at the pole where it is smaller.
 const POLE: f64 = 0.25;
-/// Spread of the first column by that of others, at least: the border of an object before a plain background has none.
+/// Minimum spread of the first column relative to the mean of all columns: the border of an image of an object on a plain background has
+/// none.
 const BORDER: f64 = 0.5;
 /// JPEG quality of the faces.
 const QUALITY: u8 = 95;
@@ -38,12 +40,13 @@ pub struct PanoramaFace {
     pub name: String,
     /// Its camera: a pinhole.
     pub camera: Intrinsics,
-    /// Rotation of its axes into the panorama's, which look at its middle.
+    /// Rotation from its axes to the panorama's, whose z axis points at the panorama's centre.
     pub turn: DQuat,
 }
 
-/// Which of `photos` are equirectangular panoramas of the whole sphere: twice as wide as high, and said to be by their metadata, or, as most of
-/// the same size, continued from their right edge to their left one, with one direction in the row of a pole.
+/// Which of `photos` are full-sphere equirectangular panoramas: twice as wide as high, and either declared so by their metadata or
+/// recognised by their pixels: the right edge continues at the left one, and the row of a pole shows a single direction. Pixels are
+/// judged by the median of all such photographs of the same width.
 pub fn find_panoramas(photos: &[PhotoEntry]) -> Vec<bool> {
     let mut signs: BTreeMap<u32, Vec<Signs>> = BTreeMap::new();
     let could = |photo: &PhotoEntry| {
@@ -52,7 +55,7 @@ pub fn find_panoramas(photos: &[PhotoEntry]) -> Vec<bool> {
     };
     let read: Vec<Option<Signs>> = photos
         .par_iter()
-        // What cannot be decoded is found out elsewhere.
+        // Photographs that cannot be decoded are reported elsewhere.
         .map(|photo| could(photo).then(|| photo.read(SMALL[0] as u32).ok()).flatten())
         .map(|pixels| pixels.map(|pixels| Signs::of(&pixels)))
         .collect();
@@ -68,21 +71,21 @@ pub fn find_panoramas(photos: &[PhotoEntry]) -> Vec<bool> {
         .collect()
 }
 
-/// Whether the metadata of a photograph tell the projection.
+/// Whether the metadata of a photograph declare the projection.
 fn is_declared(photo: &PhotoEntry) -> bool {
     let mut start = Vec::new();
     let read = fs::File::open(&photo.path).and_then(|file| file.take(METADATA).read_to_end(&mut start));
     read.is_ok() && start.windows(PROJECTION.len()).any(|bytes| bytes == PROJECTION)
 }
 
-/// What tells a panorama from a photograph.
+/// Measures that distinguish a panorama from an ordinary photograph.
 #[derive(Clone, Copy, Debug, Default)]
 struct Signs {
-    /// Mean difference of the first and the last column by that of columns half the width apart.
+    /// Mean difference between the first and the last column, relative to that between columns half the width apart.
     seam: f64,
-    /// Spread of the first or last row, which is less, by the mean of all rows.
+    /// The smaller spread of the first and the last row, relative to the mean of all rows.
     pole: f64,
-    /// Spread of the first column by the mean of all columns.
+    /// Spread of the first column, relative to the mean of all columns.
     border: f64,
 }
 
@@ -125,7 +128,7 @@ impl Signs {
     }
 }
 
-/// Mean distance of values from their mean.
+/// Mean absolute deviation of values from their mean.
 fn spread(values: &mut dyn Iterator<Item = f64>) -> f64 {
     let values: Vec<f64> = values.collect();
     let count = values.len() as f64;
@@ -134,7 +137,8 @@ fn spread(values: &mut dyn Iterator<Item = f64>) -> f64 {
 }
 
 impl PhotoEntry {
-    /// Writes the faces of a panorama into the folder `images` of `folder`, which is created, and those of its mask, if it has one, into `masks`.
+    /// Writes the faces of a panorama into the folder `images` of `folder`, which is created, and those of its mask, if it has one, into
+    /// `masks`.
     ///
     /// # Errors
     /// When a file cannot be read, decoded or written.
@@ -172,7 +176,7 @@ impl PhotoEntry {
     }
 }
 
-/// Without alpha.
+/// The pixels without alpha.
 fn opaque(mut pixels: Pixels) -> Pixels {
     if pixels.channels == 4 {
         pixels.data = pixels.data.chunks_exact(4).flat_map(|p| [p[0], p[1], p[2]]).collect();

@@ -16,11 +16,11 @@ const ROW: usize = 32;
 /// Parses a `.splat` file.
 ///
 /// # Errors
-/// When its length is no multiple of 32 bytes: it has no other structure that could be checked.
+/// When its length is not a multiple of 32 bytes; there is no other structure to check.
 pub fn parse(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     if !bytes.len().is_multiple_of(ROW) {
         return Err(Malformed(format!(
-            "its {} bytes are no multiple of {ROW}; it is truncated or not a .splat file",
+            "its length of {} bytes is not a multiple of {ROW}; it is truncated or not a .splat file",
             bytes.len()
         )));
     }

@@ -1,5 +1,5 @@
-//! From the axes of another format to ours. Most formats have the axes of the Inria code, as we do; where one has others, positions,
-//! rotations and the bands of the spherical harmonics change with them.
+//! From the axes of another format to ours. Most formats have the axes of the Inria code, as we do; if one has others, positions,
+//! rotations and the bands of the spherical harmonics are converted.
 
 use crate::splats::rows::CHUNK;
 use glam::{DMat3, DQuat, DVec3};
@@ -25,14 +25,14 @@ impl Signs {
 
     /// A rotation `w, x, y, z` in the other axes.
     ///
-    /// The Gaussian's own axes change with the world's, which changes nothing, as it is symmetric about them; so that only signs
-    /// change, and no bit is lost.
+    /// The Gaussian's own axes change with the world's, which has no effect since it is symmetric about them. Only signs change, so
+    /// no bit is lost.
     pub fn quat(self, [w, x, y, z]: [f32; 4]) -> [f32; 4] {
         let [sx, sy, sz] = self.0;
         [w, x * sy * sz, y * sx * sz, z * sx * sy]
     }
 
-    /// The sign of each coefficient above DC, up to degree 4: that of its basis function's odd powers.
+    /// The sign of each coefficient above DC, up to degree 4: the product of the signs of its basis function's odd powers.
     pub fn bands(self) -> [f32; 24] {
         let [x, y, z] = self.0;
         let one = 1.0;
@@ -85,7 +85,7 @@ impl Affine {
         }
     }
 
-    /// All splats transformed; `None` if a mirror or a collapsed axis leaves no rotation.
+    /// Transforms all splats; `None` if the map mirrors or collapses an axis, so that it has no rotation.
     pub fn apply(self, cloud: &mut GaussianCloud) -> Option<()> {
         if self == Self::IDENTITY {
             return Some(());
@@ -274,7 +274,7 @@ mod tests {
         })
     }
 
-    /// Covariance, and the colour seen along a direction.
+    /// Covariance of splat `i`.
     fn covariance(cloud: &GaussianCloud, i: usize) -> DMat3 {
         let scale = DVec3::from(cloud.log_scales[i].map(|s| f64::from(s).exp()));
         let axes = DMat3::from_quat(dquat(cloud.quats[i])) * DMat3::from_diagonal(scale);

@@ -3,7 +3,7 @@
 //!
 //! `packed_position` and `packed_scale` (ln) hold 11, 10 and 11 bits between the chunk's bounds, `packed_rotation` the index of the
 //! largest component of `w, x, y, z` in two bits and the others in ten each, `packed_color` four bytes: the colour, between the
-//! chunk's bounds if it has those of colours, and the opacity. `f_rest` is a byte in an element of its own, from -4 to 4.
+//! chunk's colour bounds if it has any, and the opacity. `f_rest` is a byte in an element of its own, from -4 to 4.
 
 use crate::Malformed;
 use crate::ply::{Column, Ply, Rows};
@@ -19,7 +19,7 @@ pub(crate) const CHUNKS: &str = "chunk";
 const CHUNK: usize = 256;
 /// Coefficients above DC are from `-SH_RANGE` to `SH_RANGE`.
 const SH_RANGE: f32 = 4.0;
-/// Bounds of ln scale that other readers accept: an infinite bound would make a NaN of its whole chunk.
+/// Bounds of ln scale that other readers accept: an infinite bound would turn its whole chunk into NaNs.
 const MAX_LOG_SCALE: f32 = 20.0;
 
 const BOUNDS: [&str; 12] = [
@@ -140,7 +140,7 @@ impl<'a> Harmonics<'a> {
     }
 }
 
-/// The centre of the byte's step, but for the ends of the range.
+/// The centre of the byte's step, except at the ends of the range.
 fn coefficient(byte: u8) -> f32 {
     let t = match byte {
         0 => 0.0,
@@ -155,7 +155,7 @@ fn coefficient_byte(value: f32) -> u8 {
     ((value / (2.0 * SH_RANGE) + 0.5) * 256.0) as u8
 }
 
-/// Low and high bound of each of three values in a chunk.
+/// Lower and upper bounds of three values in a chunk.
 #[derive(Clone, Copy)]
 struct Range {
     low: [f32; 3],
@@ -194,7 +194,7 @@ impl Range {
     }
 }
 
-/// Writes `cloud`, along a Morton curve, so that chunks are small; colours have bounds.
+/// Writes `cloud` along a Morton curve, so that chunks are compact, and with bounds of colours.
 pub(crate) fn write(out: &mut dyn Write, cloud: &GaussianCloud) -> io::Result<()> {
     // The format stops at degree 3.
     let (degree, width) = (cloud.sh_degree.min(3), 3 * cloud.sh_coefficients());

@@ -18,15 +18,15 @@ use std::io::{self, Write};
 
 const HEADER: usize = 4096;
 const SECTION: usize = 1024;
-/// Splats of a full bucket, and the steps of a position from a bucket's centre to its side.
+/// Splats in a full bucket, and steps of a position from a bucket's centre to its side.
 const BUCKET: usize = 256;
 const STEPS: u32 = 32767;
-/// The side of a bucket's block is at most this long.
+/// Maximum side of a bucket's block.
 const MAX_BLOCK: f32 = 5.0;
-/// Coefficients of level 2 where the header gives no bounds.
+/// Bound of level 2's coefficients if the header gives none.
 const DEFAULT_RANGE: f32 = 1.5;
 
-/// Bytes of a number of position, scale and rotation, and of a coefficient.
+/// Bytes per number of position, scale and rotation, and per coefficient.
 fn sizes(level: u16) -> (usize, usize) {
     match level {
         0 => (4, 4),
@@ -52,14 +52,14 @@ struct Section<'a> {
     degree: u32,
     rows: &'a [u8],
     row: usize,
-    /// World units of a position's step; what a position of zero steps means.
+    /// World units per step of a position; offset of zero steps from the bucket's centre.
     unit: f32,
     zero: f32,
-    /// Splats in full buckets, and in a full bucket.
+    /// Splats in all full buckets, splats per full bucket, and number of full buckets.
     in_full: usize,
     bucket_size: usize,
     full: usize,
-    /// Index of the first splat of each partly filled bucket, without those in full ones.
+    /// Index of the first splat of each partly filled bucket, not counting splats in full ones.
     starts: Vec<usize>,
     /// Three floats a bucket.
     centers: &'a [u8],
@@ -89,14 +89,14 @@ fn short(bytes: &[u8], index: usize) -> u16 {
 /// Parses a `.ksplat` file.
 ///
 /// # Errors
-/// One line when its version or level is not known, or a section is larger than the file.
+/// When its version or level is not known, or a section is larger than the file.
 pub fn parse(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     let mut header = Bytes::new(bytes);
     let mut header = Bytes::new(header.take(HEADER)?);
     let (major, minor) = (header.u8()?, header.u8()?);
     if major != 0 || minor < 1 {
         return Err(Malformed(format!(
-            "not a .ksplat file of version 0.1 but {major}.{minor}"
+            "its .ksplat version is {major}.{minor}; expected 0.1"
         )));
     }
     header.take(2)?;
@@ -193,7 +193,7 @@ fn parse_sections(bytes: &[u8], count: usize, level: u16) -> Result<Vec<Section<
             starts.push(starts[starts.len() - 1] + length);
         }
         let in_partial = starts.pop().unwrap_or(0);
-        // Only compressed positions are about the centres.
+        // Only compressed positions are relative to the centres.
         if level > 0 {
             if in_full.saturating_add(in_partial) < splats {
                 return Err(wrong(format!("declares {splats} splats, and its buckets hold fewer")));
@@ -257,6 +257,8 @@ pub(crate) fn write(out: &mut dyn Write, cloud: &GaussianCloud, quality: Quality
     put(&mut header, 40, high.to_bits());
     let stored = buckets.centers.len();
     let bucket_bytes = 4 * buckets.partial.len() + 12 * stored;
+    let section_bytes = u32::try_from(bucket_bytes + row * cloud.len())
+        .map_err(|_| io::Error::other("a .ksplat file holds at most 4 GiB; choose another format"))?;
     for (at, word) in [
         (0, count),
         (4, count),
@@ -265,7 +267,7 @@ pub(crate) fn write(out: &mut dyn Write, cloud: &GaussianCloud, quality: Quality
         (16, buckets.block.to_bits()),
         (20, if level > 0 { 12 } else { 0 }),
         (24, if level > 0 { STEPS } else { 1 }),
-        (28, (bucket_bytes + row * cloud.len()) as u32),
+        (28, section_bytes),
         (32, (stored - buckets.partial.len()) as u32),
         (36, buckets.partial.len() as u32),
         (40, degree),
@@ -321,14 +323,14 @@ pub(crate) fn write(out: &mut dyn Write, cloud: &GaussianCloud, quality: Quality
     }))
 }
 
-/// Splats by blocks of space, at most [`BUCKET`] in each: full buckets first.
+/// Splats grouped by blocks of space into buckets of at most [`BUCKET`]; full buckets first.
 struct Buckets {
     /// Side of a block.
     block: f32,
     /// Splat and bucket, in the order of the file.
     order: Vec<(u32, u32)>,
     centers: Vec<[f32; 3]>,
-    /// Splats of the buckets that are not full.
+    /// Number of splats in each bucket that is not full.
     partial: Vec<u32>,
 }
 
@@ -347,7 +349,7 @@ impl Buckets {
         let extents: [f32; 3] = std::array::from_fn(|c| high[c] - low[c]);
         let longest = extents.into_iter().fold(1e-6, f32::max);
         let volume: f32 = extents.into_iter().map(|extent| extent.max(1e-3 * longest)).product();
-        // A block that holds a bucket's splats, were they spread evenly, and that floats resolve.
+        // A block that would hold one bucket of evenly spread splats, and that floats can resolve.
         let even = (volume * BUCKET as f32 / means.len().max(1) as f32).cbrt();
         let block = even.max(1e-4 * longest).min(MAX_BLOCK);
         let mut blocks: BTreeMap<[i64; 3], Vec<u32>> = BTreeMap::new();

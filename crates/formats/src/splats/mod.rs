@@ -1,7 +1,7 @@
 //! Splat scenes. A new format is one file here and one arm in each `match` below.
 //!
-//! Readers return the project's conventions and writers start from them; each format's own are in its module's first lines and, side
-//! by side, in `docs/formats.md`.
+//! Readers return the project's conventions and writers start from them; each format's own conventions are described at the top of its
+//! module and, side by side, in `docs/formats.md`.
 
 pub(crate) mod antimatter;
 mod axes;
@@ -42,7 +42,7 @@ pub enum SplatFormat {
     Ksplat,
     /// `.sog`, PlayCanvas's images in a zip archive.
     Sog,
-    /// The same as a folder, named by itself or by its `meta.json`.
+    /// The same as a folder, given by its own path or that of its `meta.json`.
     SogFolder,
     /// `.glb`, binary glTF with `KHR_gaussian_splatting`.
     Glb,
@@ -113,10 +113,10 @@ impl SplatFormat {
         })
     }
 
-    /// As [`SplatFormat::of`], of what is there to be read.
+    /// Like [`SplatFormat::of`], for a file or folder that exists.
     ///
     /// # Errors
-    /// Besides, when there is nothing, or a folder without a scene.
+    /// In addition, when `path` does not exist, or is a folder without a scene.
     pub(crate) fn of_existing(path: &Path) -> Result<Self, FormatError> {
         Self::of(path).map_err(|unknown| match std::fs::metadata(path) {
             Err(source) => FormatError::Read {
@@ -128,7 +128,7 @@ impl SplatFormat {
         })
     }
 
-    /// Whether what is written is equal to the bit when it is read.
+    /// Whether the format preserves every bit.
     pub fn is_lossless(self) -> bool {
         matches!(self, Self::Ply | Self::Npz)
     }
@@ -153,7 +153,7 @@ impl SplatFormat {
         }
     }
 
-    /// Whether the format says that a scene was trained with the Mip-Splatting filters.
+    /// Whether the format records that a scene was trained with the Mip-Splatting filters.
     fn holds_antialiased(self) -> bool {
         matches!(self, Self::Ply | Self::Spz | Self::GlbSpz | Self::Sog | Self::SogFolder)
     }
@@ -175,7 +175,7 @@ impl fmt::Display for SplatFormat {
     }
 }
 
-/// How much a lossy format may lose, where it leaves the choice.
+/// How much a lossy format may lose, if it leaves a choice.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Quality {
     /// Smaller: fewer bits or palette entries for the harmonics, `.ksplat` of level 2.
@@ -206,11 +206,11 @@ pub struct WriteOptions {
     pub quality: Quality,
     /// The version of SPZ files.
     pub spz_version: SpzVersion,
-    /// How fine the numbers of SOG are; by the quality if `None`.
+    /// Precision of SOG's numbers; chosen by the quality if `None`.
     pub sog: Option<SogDetail>,
 }
 
-/// How fine the numbers of SOG are, beyond what the format asks for: coarser ones take fewer bytes.
+/// Precision of SOG's numbers, which may be coarser than the format allows: coarser numbers take fewer bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SogDetail {
     /// Entries of the palette of harmonics, 2 to 65,536.
@@ -219,12 +219,12 @@ pub struct SogDetail {
     pub position_bits: u32,
     /// Bits of each component of a rotation, 1 to 8.
     pub rotation_bits: u32,
-    /// Numbers of the codebooks of scales and colours, 2 to 256.
+    /// Entries of the codebooks of scales and colours, 2 to 256.
     pub numbers: usize,
 }
 
 impl SogDetail {
-    /// For `count` splats: as fine as can be, but for the palette, which has a power of two below their number.
+    /// For `count` splats: the finest, except for the palette, whose size is a power of two below `count` (or `count` if that is small).
     pub fn of(quality: Quality, count: usize) -> Self {
         let most = match quality {
             Quality::Low => 4096,
@@ -243,10 +243,10 @@ impl SogDetail {
     }
 }
 
-/// A splat scene as read from a file, and what was not.
+/// A splat scene as read from a file, and what was left out.
 #[derive(Clone, Debug)]
 pub struct SplatFile {
-    /// The file's format, which for PLY is found in its header.
+    /// The file's format; for PLY, as its header shows.
     pub format: SplatFormat,
     /// The splats.
     pub cloud: GaussianCloud,
@@ -257,7 +257,7 @@ pub struct SplatFile {
 }
 
 impl SplatFile {
-    /// What the reader of the file should know, a line each.
+    /// What the user should know about the file, one line each.
     pub fn warnings(&self) -> Vec<String> {
         let left_out = (self.left_out > 0).then(|| left_out_line(self.left_out));
         let unread = (!self.unread.is_empty()).then(|| format!("properties not read: {}", self.unread.join(", ")));
@@ -277,7 +277,7 @@ pub fn read_splats(path: &Path) -> Result<GaussianCloud, FormatError> {
     Ok(read_splat_file(path)?.cloud)
 }
 
-/// [`read_splats`], and what was left out.
+/// Like [`read_splats`], and reports what was left out.
 ///
 /// # Errors
 /// The same.
@@ -295,7 +295,7 @@ pub fn read_splat_file(path: &Path) -> Result<SplatFile, FormatError> {
         })?,
         SplatFormat::SogFolder => sog::read_folder(&sog_meta(path))?,
         SplatFormat::Gltf => read_and_parse(path, |text| gltf::parse_gltf(text, &|name| read_beside(path, name)))?,
-        // Nothing is read for what is never read.
+        // Refused before the file is read.
         SplatFormat::Npz => return Err(FormatError::malformed(path, "NumPy archives are written, not read")),
         _ => read_and_parse(path, |bytes| parse(format, bytes))?,
     };
@@ -308,7 +308,7 @@ pub fn read_splat_file(path: &Path) -> Result<SplatFile, FormatError> {
     })
 }
 
-/// The splats in a file of one piece.
+/// The splats in the bytes of a single file.
 fn parse(format: SplatFormat, bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     match format {
         SplatFormat::Ply | SplatFormat::CompressedPly | SplatFormat::PointsPly => ply::parse_splat_ply(bytes),
@@ -318,23 +318,23 @@ fn parse(format: SplatFormat, bytes: &[u8]) -> Result<GaussianCloud, Malformed> 
         SplatFormat::Sog | SplatFormat::SogFolder => sog::parse(bytes),
         SplatFormat::Glb | SplatFormat::GlbSpz => gltf::parse_glb(bytes),
         SplatFormat::Gltf => gltf::parse_gltf(bytes, &|name| {
-            Err(Malformed(format!("names the file {}", crate::zip::shown(name))))
+            Err(Malformed(format!("needs the file {}", crate::zip::shown(name))))
         }),
         SplatFormat::Npz => Err(Malformed("NumPy archives are written, not read".into())),
     }
 }
 
-/// The splats in the bytes of a file of one piece; a `.ply` may be compressed. Splats that cannot be drawn are left out.
+/// The splats in the bytes of a single file; a `.ply` may be compressed. Splats that cannot be drawn are left out.
 ///
 /// # Errors
-/// When the format cannot be read, or the bytes are damaged or name another file.
+/// When the format cannot be read, or the bytes are damaged or refer to another file.
 pub fn parse_splats(format: SplatFormat, bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     let mut cloud = parse(format, bytes)?;
     rows::leave_out_invalid(&mut cloud);
     Ok(cloud)
 }
 
-/// The bytes of a splat file. A folder of images is one archive.
+/// The bytes of a splat file. A folder of SOG images becomes one archive.
 ///
 /// # Errors
 /// When the format cannot hold the cloud.
@@ -352,7 +352,7 @@ pub fn encode_splats(format: SplatFormat, cloud: &GaussianCloud, options: &Write
     Ok(bytes)
 }
 
-/// `cloud` as it is after it was written and read again, and the bytes that this takes. A folder of images is taken as one archive.
+/// `cloud` after it was written and read again, and the number of bytes written. A folder of SOG images becomes one archive.
 ///
 /// # Errors
 /// When the format cannot hold the cloud, or cannot be read.
@@ -376,7 +376,7 @@ pub fn through_format(
     Ok((read, bytes.len()))
 }
 
-/// Whether the folder `path` is a scene in images: other programs, too, call a file `meta.json`.
+/// Whether the folder `path` is a scene of SOG images; other programs have files named `meta.json`, too.
 pub fn is_sog_folder(path: &Path) -> bool {
     let meta = path.join(sog::META);
     let is_short = fs::metadata(&meta).is_ok_and(|file| file.is_file() && file.len() <= sog::MAX_META as u64);
@@ -391,7 +391,7 @@ fn sog_meta(path: &Path) -> PathBuf {
     }
 }
 
-/// The content of a file that `path` names: in its folder or below it.
+/// The content of the file `name` to which the file `path` refers; it must be in the folder of `path` or below.
 fn read_beside(path: &Path, name: &str) -> Result<Vec<u8>, Malformed> {
     let relative = Path::new(name);
     let is_below = relative
@@ -399,14 +399,14 @@ fn read_beside(path: &Path, name: &str) -> Result<Vec<u8>, Malformed> {
         .all(|part| matches!(part, std::path::Component::Normal(_)));
     if !is_below || name.contains([':', '\\']) {
         return Err(Malformed(format!(
-            "names the file {}, which is not in its folder",
+            "refers to the file {}, which is not in its folder",
             crate::zip::shown(name)
         )));
     }
     read_file(&path.with_file_name("").join(relative)).map_err(|error| Malformed(error.to_string()))
 }
 
-/// Bytes on the disk of the scene `path`, a file or a folder of images.
+/// Size on disk of the scene `path`, bytes; a file or a folder of SOG images.
 ///
 /// # Errors
 /// When it cannot be read.
@@ -430,7 +430,7 @@ pub fn splat_file_size(path: &Path) -> Result<u64, FormatError> {
     Ok(total)
 }
 
-/// Writes a splat scene, atomically; the end of the name selects the format, its own default the quality.
+/// Writes a splat scene, atomically, with the format's default quality; the end of the name selects the format.
 ///
 /// # Errors
 /// When the format is unknown or the file cannot be written.
@@ -441,7 +441,7 @@ pub fn write_splats(path: &Path, cloud: &GaussianCloud) -> Result<(), FormatErro
     write_splats_with(path, cloud, &WriteOptions::default()).map(drop)
 }
 
-/// [`write_splats`] with options; returns what the format could not hold, a line each.
+/// [`write_splats`] with options; returns what the format could not hold, one line each.
 ///
 /// # Errors
 /// The same.
@@ -473,7 +473,7 @@ pub fn write_splats_with(
     }
     if cloud.antialiased && !format.holds_antialiased() {
         notes.push(format!(
-            "{format} does not say that the scene was trained with antialiasing"
+            "{format} cannot record that the scene was trained with antialiasing"
         ));
     }
     match format {
@@ -483,7 +483,7 @@ pub fn write_splats_with(
     Ok(notes)
 }
 
-/// Writes the file of one piece; a folder of images is one archive.
+/// Writes a single file; a folder of SOG images becomes one archive.
 fn encode(
     format: SplatFormat,
     out: &mut dyn io::Write,
@@ -506,7 +506,7 @@ fn encode(
     }
 }
 
-/// The splats that can be drawn, in the coordinates of the dataset, about the origin of its world if that is far away: other formats
+/// The splats that can be drawn, in the dataset's coordinates, relative to the origin of its world if that is far away: formats other
 /// than PLY hold neither doubles nor a second coordinate system.
 fn prepared<'a>(cloud: &'a GaussianCloud, notes: &mut Vec<String>) -> Cow<'a, GaussianCloud> {
     let mut cloud = Cow::Borrowed(cloud);
@@ -526,7 +526,7 @@ fn prepared<'a>(cloud: &'a GaussianCloud, notes: &mut Vec<String>) -> Cow<'a, Ga
         if world.center != glam::DVec3::ZERO {
             let glam::DVec3 { x, y, z } = world.center;
             notes.push(format!(
-                "positions are relative to ({x}, {y}, {z}), which is too far away for floats"
+                "positions are relative to ({x}, {y}, {z}), which is too far from the origin for floats"
             ));
         }
     }
@@ -536,7 +536,7 @@ fn prepared<'a>(cloud: &'a GaussianCloud, notes: &mut Vec<String>) -> Cow<'a, Ga
     cloud
 }
 
-/// Writes the files of a scene in images, `meta.json` last.
+/// Writes a folder of SOG images, `meta.json` last.
 fn write_folder(meta: &Path, cloud: &GaussianCloud, options: &WriteOptions) -> Result<(), FormatError> {
     let failed = |source| FormatError::Write {
         path: meta.to_owned(),
@@ -546,7 +546,7 @@ fn write_folder(meta: &Path, cloud: &GaussianCloud, options: &WriteOptions) -> R
     if let Some(folder) = meta.parent().filter(|folder| !folder.as_os_str().is_empty()) {
         fs::create_dir_all(folder).map_err(failed)?;
     }
-    // Without it the folder is no scene, rather than one whose images are of two.
+    // Without it, an interrupted write leaves a folder that is no scene, rather than a mixture of two.
     if meta.exists() {
         fs::remove_file(meta).map_err(failed)?;
     }

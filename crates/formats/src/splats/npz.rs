@@ -1,4 +1,5 @@
-//! NumPy's `.npz`: the columns of a scene as arrays, for programs. <https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html>
+//! NumPy's `.npz`: the columns of a scene as arrays, for other programs.
+//! <https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html>
 
 use crate::zip::Writer;
 use irradia_scene::GaussianCloud;
@@ -8,7 +9,7 @@ use std::io::{self, Write};
 pub(crate) fn write(out: &mut dyn Write, cloud: &GaussianCloud) -> io::Result<()> {
     let n = cloud.len();
     let mut archive = Writer::new(out);
-    // One array at a time: they are as large as the scene.
+    // One array at a time: together they are as large as the scene.
     archive.file("means.npy", &npy(&[n, 3], cloud.means.as_flattened()))?;
     archive.file("quats.npy", &npy(&[n, 4], cloud.quats.as_flattened()))?;
     archive.file("log_scales.npy", &npy(&[n, 3], cloud.log_scales.as_flattened()))?;

@@ -2,8 +2,9 @@
 //! `x y z nx ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3`, little-endian floats. `f_rest` is channel-major:
 //! all of red's coefficients, then green's, then blue's. `rot` is `w x y z`; scales are ln, opacity is a logit.
 //!
-//! Files have the dataset's coordinates. If these are far from the origin, `x y z` are doubles, since floats are centimetres apart
-//! at 500 km in millimetres; a comment then holds [`GaussianCloud::world_from_dataset`], by which reading returns to floats.
+//! Files have the dataset's coordinates. If these are far from the origin, `x y z` are doubles, since at 500 km in millimetres
+//! neighbouring floats are centimetres apart; a comment then holds [`GaussianCloud::world_from_dataset`], with which reading returns to
+//! floats.
 
 use crate::Malformed;
 use crate::ply::{Column, Ply, Rows, name_of};
@@ -27,12 +28,11 @@ const DC: [&str; 3] = ["f_dc_0", "f_dc_1", "f_dc_2"];
 const SCALE: [&str; 3] = ["scale_0", "scale_1", "scale_2"];
 const ROTATION: [&str; 4] = ["rot_0", "rot_1", "rot_2", "rot_3"];
 
-/// Parses a splat PLY, compressed or not: any encoding, any order of properties, SH degree 0 to 4 by the number of `f_rest`; other numbers of
-/// splats become [`GaussianCloud::extra`], other content of the file is skipped. Floats are preserved bit for bit.
+/// Parses a splat PLY, compressed or not: any encoding, any order of properties, SH degree 0 to 4 by the number of `f_rest`. Other scalar
+/// properties of splats become [`GaussianCloud::extra`]; other content of the file is skipped. Floats are preserved bit for bit.
 ///
 /// # Errors
-/// One line when the header is invalid, properties are missing (all are named), or the file is shorter than the header
-/// declares.
+/// When the header is invalid, properties are missing (all are named), or the file is shorter than the header declares.
 pub fn parse_splat_ply(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     let ply = Ply::parse(bytes)?;
     if ply.has(compressed_ply::CHUNKS) {
@@ -65,7 +65,7 @@ pub fn parse_splat_ply(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     Ok(cloud)
 }
 
-/// Numbers of splats that are not ours; of a name that is there twice the first.
+/// Scalar properties of splats that are not ours; if a name occurs twice, the first.
 fn extra_columns(rows: &Rows) -> Vec<ExtraColumn> {
     let mut found: Vec<(&str, Column)> = Vec::new();
     for (name, column) in rows.named_columns() {
@@ -85,7 +85,7 @@ fn extra_columns(rows: &Rows) -> Vec<ExtraColumn> {
     found.into_par_iter().map(read).collect()
 }
 
-/// Whether a property is one of ours; the normals that everybody writes and nobody uses are.
+/// Whether a property is one of ours, among them the normals that everybody writes and nobody uses.
 fn is_known(name: &str) -> bool {
     let known = [&POSITION[..], &DC, &SCALE, &ROTATION, &["nx", "ny", "nz", "opacity"]];
     known.into_iter().flatten().any(|known| *known == name) || name.starts_with("f_rest_")
@@ -119,7 +119,7 @@ fn world_in(ply: &Ply) -> Result<Similarity, Malformed> {
     )))
 }
 
-/// The properties of the splats that are neither ours nor kept: lists, and whatever a compressed file has beyond its own.
+/// The properties of the splats that are neither ours nor kept: lists, and additional properties of a compressed file.
 pub(crate) fn unread_properties(bytes: &[u8]) -> Vec<String> {
     let Ok(ply) = Ply::parse(bytes) else { return Vec::new() };
     let keeps = !ply.has(compressed_ply::CHUNKS);
@@ -173,7 +173,7 @@ impl Columns {
     }
 }
 
-/// Names all missing properties at once, before reading the body; returns the SH degree.
+/// Checks, before the body is read, that no property is missing, naming all that are; returns the SH degree.
 fn check_properties(ply: &Ply) -> Result<u32, Malformed> {
     let names: Vec<&str> = ply.property_names("vertex")?.collect();
     let needed = POSITION

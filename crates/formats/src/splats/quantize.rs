@@ -1,4 +1,4 @@
-//! How numbers become a few bits and back: the steps that several formats have in common.
+//! Quantisation of numbers to a few bits and back, as far as several formats share it.
 
 use irradia_scene::sh;
 
@@ -26,7 +26,7 @@ pub(crate) fn opacity_byte(logit: f32) -> u8 {
     byte(sigmoid(logit) * 255.0)
 }
 
-/// The nearest byte; beyond the range its end, for NaN 0.
+/// The nearest byte, clamped to the range; 0 for NaN.
 pub(crate) fn byte(value: f32) -> u8 {
     value.round() as u8
 }
@@ -53,7 +53,7 @@ pub(crate) fn dc_of_byte(color: u8) -> f32 {
     sh::dc_from_color(f32::from(color) / 255.0)
 }
 
-/// A quaternion of length 1; one of no length becomes the identity.
+/// The quaternion at length 1; one of zero or infinite length becomes the identity.
 pub(crate) fn normalized(quat: [f32; 4]) -> [f32; 4] {
     let length = quat.iter().map(|v| v * v).sum::<f32>().sqrt();
     match length > 0.0 && length.is_finite() {

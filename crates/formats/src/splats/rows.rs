@@ -6,10 +6,10 @@ use rayon::prelude::*;
 
 /// Splats converted per task.
 pub(crate) const CHUNK: usize = 16_384;
-/// A compressed file that declares more splats for each of its bytes is damaged or made to fill the memory. The best known
-/// compression needs several bytes a splat.
+/// Maximum number of splats per byte of a compressed file; a file that declares more is damaged or designed to exhaust memory. The best
+/// known compression needs several bytes per splat.
 const MAX_SPLATS_PER_BYTE: u64 = 16;
-/// And this many splats are never too many.
+/// This many splats are allowed in any file.
 const ALWAYS_ALLOWED: u64 = 4096;
 
 /// The parameters of one splat, to be filled in.
@@ -78,7 +78,7 @@ pub(crate) fn encode_rows(count: usize, width: usize, encode: impl Fn(usize, &mu
     bytes
 }
 
-/// The number of splats that a compressed file of `bytes` bytes declares, checked before memory is taken for them.
+/// The number of splats that a compressed file of `bytes` bytes declares, checked before memory is allocated for them.
 pub(crate) fn plausible_count(declared: u64, bytes: usize) -> Result<usize, Malformed> {
     let most = (bytes as u64).saturating_mul(MAX_SPLATS_PER_BYTE).max(ALWAYS_ALLOWED);
     usize::try_from(declared)
@@ -91,7 +91,7 @@ pub(crate) fn plausible_count(declared: u64, bytes: usize) -> Result<usize, Malf
         })
 }
 
-/// Whether splat `i` can be drawn: its position, rotation and colour are finite, its size and opacity no NaN, its size not infinite.
+/// Whether splat `i` can be drawn: position, rotation and colour are finite, size and opacity are not NaN, and the size is not infinite.
 fn is_valid(cloud: &GaussianCloud, i: usize) -> bool {
     let width = 3 * cloud.sh_coefficients();
     let finite = |values: &[f32]| values.iter().all(|v| v.is_finite());

@@ -8,7 +8,7 @@ use std::collections::HashMap;
 /// Index of an object. Objects refer to one another by index, so that cycles and deep nesting are cheap.
 pub(super) type Id = usize;
 
-/// The content of a pickle.
+/// An object in a pickle.
 #[derive(Clone, Debug)]
 pub(super) enum Object {
     /// None, true, false, and integers of more than 8 bytes.
@@ -34,7 +34,7 @@ pub(super) struct Pickle {
     pub(super) top: Id,
 }
 
-/// Maximum number of objects of a pickle; VGG16's state dict has some hundred.
+/// Maximum number of objects of a pickle; VGG16's state dict has a few hundred.
 const MAX_OBJECTS: usize = 1 << 20;
 
 impl Pickle {
@@ -228,7 +228,7 @@ impl Machine {
         }
     }
 
-    /// Checks `count` more against [`MAX_OBJECTS`].
+    /// Counts `count` more objects and checks the sum against [`MAX_OBJECTS`].
     fn grow(&mut self, count: usize) -> Result<(), Malformed> {
         self.grown += count;
         if self.grown > MAX_OBJECTS {

@@ -64,7 +64,7 @@ pub(super) fn from_stream(bytes: &[u8], wanted: Wanted) -> Result<BTreeMap<Strin
     {
         let key = keys.text(*key).ok_or_else(|| wrong("a storage has no name"))?;
         let size = kinds.get(key).and_then(|kind| value_size(kind));
-        let size = size.ok_or_else(|| wrong(format_args!("storage {key} is of no known type")))?;
+        let size = size.ok_or_else(|| wrong(format_args!("storage {key} has an unknown type")))?;
         let count = bytes.count(size, "values")?;
         storages.insert(key, bytes.take(count * size)?);
     }
@@ -154,7 +154,7 @@ impl<'a> Rebuilt<'a> {
     }
 }
 
-/// The wanted tensors of the state dict; in total they have no more values than the file of `total` bytes.
+/// The wanted tensors of the state dict. Together they must not have more values than fit in the file's `total` bytes.
 fn tensors<'a>(
     pickle: &Pickle,
     total: usize,
@@ -162,7 +162,7 @@ fn tensors<'a>(
     storage: &dyn Fn(&str) -> Option<&'a [u8]>,
 ) -> Result<BTreeMap<String, Tensor>, Malformed> {
     let Object::Dict(entries) = pickle.object(pickle.top) else {
-        return Err(wrong("it contains another object; save the model's state_dict()"));
+        return Err(wrong("it does not contain a state dict; save the model's state_dict()"));
     };
     let mut room = total / size_of::<f32>();
     let mut tensors = BTreeMap::new();

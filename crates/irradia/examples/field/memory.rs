@@ -1,7 +1,7 @@
-//! Memory-bound limits of a hash grid: only its accesses at random places.
+//! Memory-bound limits of a hash grid, measured from its random accesses alone.
 //!
-//! A limit can be exceeded: neighbours on a ray share corners, and the coarse levels' cells, so that an encoding finds more in
-//! the first-level cache than random accesses do.
+//! The encoding can exceed a limit: neighbouring samples on a ray share corners and coarse cells, so that it hits the first-level
+//! cache more often than random accesses do.
 
 use crate::bench::time;
 use cpu_time::ProcessTime;
@@ -36,7 +36,7 @@ fn of_features<const F: usize>(grid: &HashGrid, samples: usize) -> Limits {
     let levels = grid.level_table();
     let mut table = vec![[1.0f32; F]; grid.parameters() / F];
     let mut rng = Rng::new(5, 6);
-    // Few enough for the first-level cache; shifted from turn to turn, so that they cover all of a table.
+    // Few enough for the first-level cache; shifted from turn to turn so that they cover the whole table.
     let places: Vec<[u32; 8]> = (0..512).map(|_| std::array::from_fn(|_| rng.below(u32::MAX))).collect();
     let turn = |t: usize| (t as u32).wrapping_mul(2_654_435_761);
     let place =

@@ -1,8 +1,9 @@
-//! What a training step on a GPU has to move and to compute, stage by stage, beside the same counts for gsplat's kernels: a floor that needs
-//! no card. The numbers of visible splats and of entries are those of the scenes of `speed -- gpu`, found by the kernels themselves.
+//! Bytes and operations of a training step on a GPU, stage by stage, beside the same counts for gsplat's kernels: a lower bound that
+//! needs no graphics card. The numbers of visible splats and of entries are those of the scenes of `speed -- gpu`, found by the kernels
+//! themselves.
 //!
-//! A word of 4 bytes counts each time that a kernel reads or writes it, cached or not, except where neighbouring threads read the same word.
-//! Every entry of a tile is blended with all 256 pixels: what ends early is not subtracted, on either side.
+//! A word of 4 bytes counts each time a kernel reads or writes it, cached or not, except where neighbouring threads read the same word.
+//! Every entry of a tile is blended with all 256 pixels: early termination is not subtracted, on either side.
 
 use crate::scale::{camera, scene};
 use anyhow::Result;
@@ -13,7 +14,7 @@ use irradia_splat::{GpuRenderer, RenderOptions, Renderer, Splats, ViewParams};
 /// Bytes per second and operations (float32, fused as two) per second of an H100 SXM, by its data sheet.
 const H100: [f64; 2] = [3.35e12, 67e12];
 
-/// Splats of a part, and rows of pixels, whole tiles: the counts of parts add up, and fit into the smallest arrays.
+/// Splats and pixel rows of a part. Rows are whole tiles, so that the counts of parts add up; a part fits into the smallest arrays.
 const PART: usize = 500_000;
 const ROWS: u32 = 1088;
 
@@ -152,7 +153,7 @@ fn count(renderer: &mut GpuRenderer, splats: &Splats, [width, height]: [u32; 2])
     for first in (0..splats.len()).step_by(PART) {
         let part: Vec<u32> = (first as u32..splats.len().min(first + PART) as u32).collect();
         let mut part = splats.gather(&part);
-        // Harmonics decide nothing here.
+        // Harmonics do not affect the counts.
         let mut base = Planes::zeros(3, part.len());
         (0..3).for_each(|c| base.plane_mut(c).copy_from_slice(part.sh.plane(c)));
         part.sh = base;

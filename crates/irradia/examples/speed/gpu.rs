@@ -11,7 +11,7 @@ use irradia_splat::{DeviceGradient, Engine, RenderOptions, SplatState, Statistic
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Each case is a number of splats and a size, such as `1000000@1920x1080`; without any, those of RESULTS.md.
+/// Each case is a number of splats and a size, such as `1000000@1920x1080`; without any, the cases of RESULTS.md.
 pub fn run(cases: &[String]) -> Result<()> {
     println!("{}", Device::Gpu(Gpu::open(&Wanted::Any)?));
     let usual = [100_000, 1_000_000, 3_000_000].into_iter();
@@ -22,7 +22,7 @@ pub fn run(cases: &[String]) -> Result<()> {
         cases => cases.iter().map(|case| parsed(case)).collect::<Result<_>>()?,
     };
     for (number, size) in cases {
-        // A scene that does not fit says nothing of the others.
+        // A scene that does not fit does not end the measurement of the others.
         if let Err(error) = measure(number, size) {
             println!("  not measured: {error}");
         }
@@ -40,12 +40,12 @@ fn parsed(case: &str) -> Result<(usize, [u32; 2])> {
     Ok((number.parse()?, [width.parse()?, height.parse()?]))
 }
 
-/// Frames that are submitted before the last one is waited for.
+/// Number of frames submitted before waiting for the last one.
 const MANY: u32 = 200;
 
-/// Writes a case for other renderers, such as `bench/peer_gsplat.py`: little endian, the numbers of splats, columns and rows (u32); as f32 fx,
-/// fy, cx, cy, the 4 x 4 matrix from world to camera row by row, and the splats' means, quaternions (w first), ln of scales, logits of
-/// opacities and harmonics, 16 coefficients of three channels each.
+/// Writes a case for other renderers, such as `bench/peer_gsplat.py`: little endian, the numbers of splats, columns and rows (u32); as f32
+/// fx, fy, cx, cy, the 4 x 4 matrix from world to camera row by row, and the splats' means, quaternions (w first), ln of scales, logits
+/// of opacities and harmonics, 16 coefficients of three channels each.
 pub fn export(path: &str, case: &str) -> Result<()> {
     let (number, [width, height]) = parsed(case)?;
     let (splats, view) = (scene(number), ViewParams::new(&camera(width, height, 1.0)));
@@ -63,7 +63,7 @@ pub fn export(path: &str, case: &str) -> Result<()> {
     std::fs::write(path, bytes).with_context(|| format!("{path}: cannot be written"))
 }
 
-/// Seconds of a frame that is waited for, of one of many that are not, and of a step with loss, backward pass and update.
+/// Seconds per frame with a wait after each, per frame with a wait after many, and per step with loss, backward pass and update.
 struct Spent {
     frame: f64,
     frame_of_many: f64,
@@ -73,7 +73,7 @@ struct Spent {
 fn measure(number: usize, [width, height]: [u32; 2]) -> Result<()> {
     let state = SplatState::new(scene(number));
     println!("{number} splats, {width} x {height}");
-    // The clock stops the device after every kernel: whole frames and steps are timed on one without.
+    // Profiling stops the device after every kernel, so whole frames and steps are timed on a device without it.
     let [timed, profiled] = [Gpu::open(&Wanted::Any)?, Gpu::open(&Wanted::Any)?];
     let (spent, engine) = time(&timed, &state, [width, height], None)?;
     println!(
@@ -146,7 +146,7 @@ fn time(
         });
         engine.update(&update);
         loss.finish();
-        // Where there was no room, the next step is the repetition.
+        // If there was no room, the next step serves as the repetition.
         let _ = engine.settle();
     };
     let each = |engine: &mut Engine, work: &mut dyn FnMut(&mut Engine)| {

@@ -24,7 +24,7 @@ pub fn limits() -> Limits {
         let operations: f64 = (0..threads as u32).into_par_iter().map(|_| level.run(Peak)).sum();
         began.elapsed().as_secs_f64() / operations
     });
-    // Beyond every cache that belongs to a core; 512 MiB.
+    // 512 MiB: larger than every cache of a core.
     let mut values = vec![1.0f32; 1 << 27];
     let memory = best(&mut || {
         let began = ProcessTime::now();
@@ -41,7 +41,7 @@ pub fn limits() -> Limits {
     }
 }
 
-/// Resident memory of this process now and at its highest since [`reset_peak`], bytes; zeros where the system does not tell.
+/// Resident memory of this process now and at its highest since [`reset_peak`], bytes; zeros if the system does not report it.
 pub fn resident() -> [u64; 2] {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     ["VmRSS:", "VmHWM:"].map(|key| {
@@ -51,8 +51,8 @@ pub fn resident() -> [u64; 2] {
     })
 }
 
-/// Lets the highest resident memory begin again at the present one; Linux.
+/// Resets the highest resident memory to the current value; Linux only.
 pub fn reset_peak() {
-    // Without it the figure is that of the whole process so far.
+    // On failure the figure is the maximum since the process started.
     let _ = std::fs::write("/proc/self/clear_refs", "5");
 }

@@ -1,4 +1,4 @@
-//! The committed benchmark.
+//! The project's speed benchmark.
 //!
 //! ```text
 //! cargo run --release -p irradia --example speed -- steps DATA [STEPS]   a training step and its parts

@@ -24,13 +24,13 @@ use std::time::Instant;
 const NUMBERS: f64 = 59.0;
 
 /// Operations of a splat's projection, of its colour, and of a splat-pixel pair forward and backward, counted in the source; an
-/// exponential counts as 12. They tell how far a stage is from the processor's peak, no more exactly than that.
+/// exponential counts as 12. They are rough, and only tell how far a stage is from the processor's peak.
 const PROJECT: f64 = 260.0;
 const COLOR: f64 = 160.0;
 const PAIR: f64 = 30.0;
 const PAIR_VJP: f64 = 62.0;
 
-/// `numbers` of splats, or all three, at both sizes.
+/// Measures each of `numbers` of splats at both image sizes.
 pub fn run(numbers: &[usize]) -> Result<()> {
     let limits = machine::limits();
     println!(
@@ -161,7 +161,7 @@ fn parts(engine: &mut Engine, camera: &Camera, repeats: u32, limits: &Limits) {
     );
 }
 
-/// The rates are so small that the scene stays as it is.
+/// An update with rates so small that the scene does not change.
 pub fn update(dense: bool, regularizers: Regularizers) -> Update {
     let rate = 1e-9;
     Update {
@@ -195,7 +195,7 @@ pub fn update(dense: bool, regularizers: Regularizers) -> Update {
     }
 }
 
-/// A step with about 5 % of the splats in view, beside one of those 5 % alone.
+/// A step with about 5 % of the splats in view, beside a step on those 5 % alone.
 fn few_in_view(engine: &mut Engine, repeats: u32) {
     let options = RenderOptions::default();
     let n = engine.len();
@@ -237,7 +237,7 @@ fn few_in_view(engine: &mut Engine, repeats: u32) {
     );
 }
 
-/// A checkpoint in a temporary folder of the system.
+/// Writes a checkpoint to the system's temporary folder.
 fn save(trainer: &Trainer, state_bytes: f64) -> Result<()> {
     let folder = tempfile::tempdir()?;
     let path = folder.path().join("checkpoint");
@@ -291,7 +291,7 @@ fn density(engine: &mut Engine, state_bytes: f64, step: f64, limits: &Limits) {
     );
 }
 
-/// A trainer whose photographs are grey, to be given splats.
+/// A trainer on synthetic photographs; the caller replaces its splats.
 fn trainer(splats: &Splats) -> Result<Trainer> {
     let photo = Photo {
         width: 1280,
@@ -335,7 +335,7 @@ fn trainer(splats: &Splats) -> Result<Trainer> {
     Ok(Trainer::new(Arc::new(dataset), recipe, TrainOptions::default())?)
 }
 
-/// Where a camera stands that sees the whole scene, turned by `angle` about its place.
+/// The pose of a camera that sees the whole scene, turned by `angle` about its position.
 fn turned(angle: f32) -> Pose {
     let position = Vec3::new(0.0, -3.0, -9.0);
     // Looks down at the origin: +Z forward, +Y down.
@@ -346,7 +346,7 @@ fn turned(angle: f32) -> Pose {
     }
 }
 
-/// The camera that sees the whole scene, or with `zoom` below 1 only its middle.
+/// A camera that sees the whole scene, or with `zoom` below 1 only its centre.
 pub fn camera(width: u32, height: u32, zoom: f32) -> Camera {
     let intrinsics = Intrinsics::from_fov_x(width, height, 1.3 * zoom);
     Camera::new(turned(0.0), intrinsics)

@@ -23,13 +23,13 @@ pub struct Args {
     /// Largest size: bytes of the file, such as 5MB or 800kB, or splats, such as 200k
     #[arg(long, value_name = "SIZE|N", value_parser = parse_target, required_unless_present = "keep_psnr")]
     pub target: Option<CompactTarget>,
-    /// PSNR to lose at most on the training views, dB; without a --target, the smallest scene that keeps it is searched
+    /// Maximum loss of PSNR on the training views, dB; without a --target, the smallest scene within that loss is searched for
     #[arg(long, value_name = "DB")]
     pub keep_psnr: Option<f64>,
-    /// Training steps for each number of splats that is tried
+    /// Training steps for each number of splats tried
     #[arg(long, value_name = "N", default_value_t = CompactInput::STEPS)]
     pub steps: u64,
-    /// How much the format may lose, where it leaves the choice (.spz, .ksplat)
+    /// How much the format may lose, if it offers a choice (.spz, .ksplat)
     #[arg(long, value_enum, default_value_t = QualityArg::Normal)]
     pub quality: QualityArg,
     /// Random seed
@@ -85,7 +85,7 @@ pub fn run(args: &Args) -> Result<()> {
     say(format_args!("{}:{}", args.out.display(), lines(&compacted)))
 }
 
-/// Before and after, a line each.
+/// Figures before and after, one line each.
 fn lines(done: &Compacted) -> String {
     let [splats, left] = done.splats;
     let mut text = size_line(done.bytes, done.formats);

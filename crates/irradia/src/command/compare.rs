@@ -62,18 +62,20 @@ pub struct Args {
     /// Threads of each run; all cores when absent
     #[arg(long, value_name = "N", value_parser = thread_count())]
     pub threads: Option<usize>,
-    /// Where recipes are trained: cpu, gpu, auto (a real GPU if there is one), or a part of a GPU's name; see irradia devices. cpu when absent
+    /// Where recipes are trained: cpu, gpu, auto (a real GPU if there is one), or a part of a GPU's name; see irradia devices. cpu when
+    /// absent
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<String>,
     /// LPIPS weights: a file, or a folder of them; see irradia lpips
     #[arg(long, value_name = "PATH")]
     pub lpips: Option<PathBuf>,
-    /// What is behind the scene: white, black, grey, a colour such as '#c8c0b4', or random (random colours in training, white in evaluation); when absent
-    /// white for Blender scenes and objects cut out on white, the colour of a white or black backdrop, the recipe's own for others
+    /// Background of the scene: white, black, grey, a colour such as '#c8c0b4', or random (random colours in training, white in
+    /// evaluation); when absent white for Blender scenes and objects cut out on white, the colour of a white or black backdrop, else that
+    /// of the recipe
     #[arg(long, value_name = "COLOR")]
     pub background: Option<Background>,
-    /// Read and score the datasets as the papers do, and show their figures: blender, llff, mipnerf360 or tandt; a dataset's folder is
-    /// named after the benchmark's scene, such as .../nerf_synthetic/chair
+    /// Read and score the datasets as the papers do, and show their figures: blender, llff, mipnerf360 or tandt; the folder of a dataset
+    /// must have the name of the benchmark's scene, such as .../nerf_synthetic/chair
     #[arg(long, value_name = "NAME", conflicts_with_all = ["downscale", "max_side", "full_size", "holdout", "background"])]
     pub protocol: Option<Protocol>,
     #[command(flatten)]
@@ -133,7 +135,7 @@ struct Source {
     data: PathBuf,
     /// Name of its folder.
     name: String,
-    /// Hash of its content; empty if it cannot be read, which its runs then report.
+    /// Hash of its content; empty if it cannot be read: its runs then report the error.
     fingerprint: String,
     /// How it is read.
     reading: Reading,
@@ -180,7 +182,7 @@ pub fn run(args: &Args) -> Result<()> {
     for source in &sources {
         let name = &source.name;
         let mut trained: Vec<Vec<Trained>> = variants.iter().map(|_| Vec::new()).collect();
-        // Recipes within seeds: other load on the machine then affects all recipes alike.
+        // Seeds in the outer loop, so that other load on the machine affects all recipes alike.
         for seed in 0..args.seeds {
             for (variant, trained) in variants.iter().zip(&mut trained) {
                 number += 1;
@@ -280,7 +282,7 @@ fn sources(args: &Args) -> Result<Vec<Source>> {
         let dataset = reading.read(data).ok();
         if dataset.as_ref().is_some_and(|dataset| dataset.test.is_empty()) {
             let message = format!(
-                "{}: no view is held out, so that recipes cannot be compared",
+                "{}: no view is held out, so the recipes cannot be compared",
                 data.display()
             );
             return Err(Usage(message).into());
@@ -383,7 +385,7 @@ fn request(args: &Args, program: &str, source: &Source, variant: &Variant, seed:
         images.and_then(Result::ok).map(|path| path.display().to_string()),
     );
     option("--background", args.background().map(|b| b.to_string()));
-    // Published figures are those of the given poses.
+    // Published figures were measured with the given poses.
     option("--poses", args.protocol.map(|_| "given".to_owned()));
     Request {
         arguments,
@@ -402,7 +404,7 @@ fn finished(folder: &Path) -> Option<(Report, Option<Request>)> {
     record.complete.then_some((report, request))
 }
 
-/// Rejects, before any training, finished runs with another request.
+/// Rejects finished runs with a different request, before any training.
 fn check_earlier(args: &Args, program: &str, variants: &[Variant], sources: &[Source]) -> Result<()> {
     for source in sources {
         for variant in variants {
@@ -511,7 +513,7 @@ fn held_out_view(out: &Path, trained: &[Vec<Trained>]) -> Option<PictureRow> {
     })
 }
 
-/// A picture as a `data:` URL: a JPEG of good quality, no larger than the page shows it.
+/// An image file as a `data:` URL: a JPEG of good quality, no larger than the page shows it.
 fn embed(path: &Path) -> Result<String> {
     const LARGEST: u32 = 1200;
     let mut shown = image::open(path).with_context(|| format!("cannot read {}", path.display()))?;

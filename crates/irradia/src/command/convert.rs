@@ -13,16 +13,16 @@ pub struct ConvertArgs {
     /// The scene to read: a splat file of any format, a folder of SOG images, or a run
     pub input: PathBuf,
     /// The file to write; its name selects the format: .ply, .compressed.ply, .points.ply, .spz, .splat, .ksplat, .sog, meta.json,
-    /// .glb, .spz.glb, .gltf, .npz, or .html for a page as irradia share writes it
+    /// .glb, .spz.glb, .gltf, .npz, or .html for a page like that of irradia share
     pub output: PathBuf,
-    /// How much a lossy format may lose, where it leaves the choice (.spz, .sog, .ksplat)
+    /// How much a lossy format may lose, if it offers a choice (.spz, .sog, .ksplat)
     #[arg(long, value_enum, default_value_t = QualityArg::Normal)]
     pub quality: QualityArg,
     /// Version of .spz files
     #[arg(long, value_name = "3|4", default_value_t = 3, value_parser = clap::value_parser!(u8).range(3..=4))]
     pub spz_version: u8,
     /// Also write levels of detail beside the output, such as scene.lod1.sog: a half, a quarter and an eighth of the splats, merged so that
-    /// they look alike from afar
+    /// they look the same from afar
     #[arg(long)]
     pub lod: bool,
     /// Do not render the scene before and after to measure the loss
@@ -86,11 +86,11 @@ pub fn convert(args: &ConvertArgs) -> Result<()> {
     Ok(())
 }
 
-/// A level, and how it looks from where it is meant for.
+/// The summary of a level of detail, with its PSNR at the size it is meant for.
 fn level_lines(level: u32, made: &Level) -> String {
     format!(
-        "{}: {} splats, {:.3} MB\n  PSNR           {:.2} dB at 1/{} of the pixels, against the scene at full size shrunk ({:.2} dB for as \
-         many splats taken evenly, {:.2} dB for the whole scene drawn so small)",
+        "{}: {} splats, {:.3} MB\n  PSNR           {:.2} dB at 1/{} of the pixels, against the scene rendered at full size and shrunk ({:.2} dB \
+         for as many splats sampled evenly, {:.2} dB for the whole scene rendered at that size)",
         made.path.display(),
         made.splats,
         made.bytes as f64 / 1e6,
@@ -101,11 +101,11 @@ fn level_lines(level: u32, made: &Level) -> String {
     )
 }
 
-/// What the conversion cost, a line each.
+/// What the conversion cost, one line each.
 fn lines(conversion: &Conversion) -> String {
     let mut text = size_line(conversion.bytes, conversion.formats);
     if let Some(psnr) = &conversion.psnr {
-        // Of all pixels together: views that are equal must not hide the others.
+        // Of all pixels together, so that identical views, of infinite PSNR, do not hide the others.
         let error = psnr.iter().map(|db| 10f64.powf(-0.1 * db)).sum::<f64>() / psnr.len() as f64;
         let mean = -10.0 * error.log10();
         let worst = psnr.iter().copied().fold(f64::INFINITY, f64::min);
@@ -114,7 +114,7 @@ fn lines(conversion: &Conversion) -> String {
                 "\n  PSNR           {mean:.2} dB, worst {worst:.2} dB, of {} views around it",
                 psnr.len()
             ),
-            false => format!("\n  PSNR           all {} views around it are equal", psnr.len()),
+            false => format!("\n  PSNR           all {} views around it are identical", psnr.len()),
         };
     }
     text + &note_lines(&conversion.notes)

@@ -45,10 +45,10 @@ pub struct SynthArgs {
     /// Scene: demo, room, shelf, outdoor or thin
     #[arg(long, value_name = "NAME", default_value_t = SceneName::Demo)]
     pub scene: SceneName,
-    /// Lens of the photographs to train on: pinhole, fisheye or equirectangular; held-out views are by a pinhole
+    /// Lens of the photographs to train on: pinhole, fisheye or equirectangular; held-out views are always of a pinhole
     #[arg(long, value_name = "NAME", default_value_t = SynthLens::Pinhole)]
     pub lens: SynthLens,
-    /// The camera of the photographs to train on moves while they are read out from top to bottom (rolling shutter), turning by this
+    /// Angle by which the camera turns while each photograph to train on is read out from top to bottom (rolling shutter)
     #[arg(long, value_name = "DEGREES", default_value_t = 0.0)]
     pub turn: f32,
 }

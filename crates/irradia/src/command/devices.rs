@@ -16,13 +16,13 @@ pub fn run() -> Result<()> {
         say(irradia_compute::DeviceError::NotBuilt)?;
     } else if gpus.is_empty() {
         say(
-            "no GPU was found: Vulkan, Metal or DX12 comes with its driver; Mesa has Vulkan in software (mesa-vulkan-drivers)",
+            "no GPU found: its driver must provide Vulkan, Metal or DX12; Mesa has a software Vulkan (mesa-vulkan-drivers)",
         )?;
     }
     Ok(())
 }
 
-/// The GPUs, a line each.
+/// The GPUs, one line each.
 #[cfg(feature = "gpu")]
 fn gpus() -> Vec<String> {
     use irradia_compute::gpu::{AdapterInfo, Gpu};

@@ -10,7 +10,7 @@ use std::path::PathBuf;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folders of photographs (JPEG, PNG, WebP, TIFF, HEIC, OpenEXR) and of films, or films; films and panoramas need --out
+    /// Folders of photographs (JPEG, PNG, WebP, TIFF, HEIC, OpenEXR) and films, or film files; films and panoramas need --out
     #[arg(required = true)]
     pub photos: Vec<PathBuf>,
     /// Folder for doctor.html, with small pictures, and doctor.json; nothing is written when absent. Features and matches are kept

@@ -15,7 +15,7 @@ use std::path::PathBuf;
 pub struct Args {
     /// The scene to read: a splat file of any format, or a run
     pub input: PathBuf,
-    /// Edits, in this order and after those of --edits: each one word in quotes, such as "delete sphere center=0,0,0 radius=1"
+    /// Edits, made in this order after those of --edits: each one quoted argument, such as "delete sphere center=0,0,0 radius=1"
     #[arg(value_name = "OP")]
     pub ops: Vec<Edit>,
     /// The file to write, its name selects the format; or a folder, which also gets the cameras and the edits
@@ -24,19 +24,19 @@ pub struct Args {
     /// Make the edits of this list first
     #[arg(long, value_name = "FILE")]
     pub edits: Option<PathBuf>,
-    /// Write all edits as a list, with what was found automatically written out
+    /// Write all edits as a list, with everything that was found automatically spelled out
     #[arg(long, value_name = "FILE")]
     pub save_edits: Option<PathBuf>,
-    /// Say what the edits would do, and write no scene
+    /// Report what the edits would do, and write no scene
     #[arg(long, conflicts_with = "out")]
     pub preview: bool,
-    /// Write before.png and after.png, seen from beside the scene, to this folder
+    /// Write before.png and after.png, renderings from a camera beside the scene, to this folder
     #[arg(long, value_name = "FOLDER")]
     pub pictures: Option<PathBuf>,
     /// Edit the run itself: its scene, and its latest checkpoint, from which it can be resumed
     #[arg(long, conflicts_with_all = ["out", "preview"])]
     pub in_place: bool,
-    /// How much a lossy format may lose, where it leaves the choice (.spz, .sog, .ksplat)
+    /// How much a lossy format may lose, if it offers a choice (.spz, .sog, .ksplat)
     #[arg(long, value_enum, default_value_t = QualityArg::Normal)]
     pub quality: QualityArg,
     /// Threads; all cores when absent
@@ -45,8 +45,8 @@ pub struct Args {
 }
 
 const OPERATIONS: &str = "\
-An OP is an operation with its keys, then the selection: shapes with their keys, each of them added, or with - subtracted, or with & \
-intersected. Without a selection, it is the whole scene. Coordinates are those of the dataset.
+An OP is an operation with its keys, then a selection: shapes with their keys, each added to it, or subtracted with a prefix -, or \
+intersected with a prefix &. Operations that need no selection apply to the whole scene without one. Coordinates are those of the dataset.
 
 Operations: delete, keep, move by=X,Y,Z, rotate axis=X,Y,Z degrees=D [about=X,Y,Z], scale factor=F [about=X,Y,Z], duplicate \
 [by=X,Y,Z], merge file=SCENE, upright [up=X,Y,Z] [ground=X,Y,Z] [axis=y|-y|z], set-length from=X,Y,Z to=X,Y,Z length=L, recolor \
@@ -54,7 +54,7 @@ Operations: delete, keep, move by=X,Y,Z, rotate axis=X,Y,Z degrees=D [about=X,Y,
 
 Shapes: all, box center=X,Y,Z size=X,Y,Z [rotation=W,X,Y,Z], sphere center=X,Y,Z radius=R, half-space point=X,Y,Z normal=X,Y,Z, \
 polygon camera.*=.. points=X,Y;X,Y;.. [visible=true], brush camera.*=.. points=X,Y;.. radius=R (docs/edit.md), color low=R,G,B high=R,G,B, opacity|size|elongation|views [min=] [max=], clusters [min=] [max=] [gap=], floaters \
-[score=], subject [margin=]; of what is selected so far: invert, grow by=R, connected [gap=]
+[score=], subject [margin=]; of the selection so far: invert, grow by=R, connected [gap=]
 
 Examples:
   irradia edit run -o clean.ply \"delete floaters\"
@@ -116,7 +116,7 @@ pub fn run(args: &Args) -> Result<()> {
     say(format_args!("{title}: {shown} splats{edits}{notes}"))
 }
 
-/// What an edit did, with what it found.
+/// The summary line of an edit, with everything that was found automatically.
 fn line(made: &Made) -> String {
     let [selected, of] = made.selected;
     let edit = made.edit.to_string();

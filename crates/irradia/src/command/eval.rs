@@ -18,7 +18,8 @@ use std::path::{Path, PathBuf};
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// The scene: RUN, or a file; background, filters, held-out views and the size of the photographs are taken from the run that contains it
+    /// The scene: RUN, or a file; background, filters, held-out views and the size of the photographs are taken from the run that contains
+    /// it
     pub scene: PathBuf,
     /// Dataset of photographs
     #[arg(long)]
@@ -26,7 +27,7 @@ pub struct Args {
     /// Views to evaluate
     #[arg(long, value_enum, default_value_t = Split::Test)]
     pub split: Split,
-    /// Fit these on the left half of each view and also measure its right half
+    /// Fit these to the left half of each view, and also measure its right half
     #[arg(long, value_enum, value_delimiter = ',', value_name = "WHAT")]
     pub half_fit: Vec<HalfFitOf>,
     /// Write the figures to this file
@@ -47,7 +48,8 @@ pub struct Args {
     /// Where views are rendered: cpu, gpu, auto (a real GPU if there is one), or a part of a GPU's name; see irradia devices
     #[arg(long, value_name = "DEVICE", default_value = "cpu")]
     pub device: String,
-    /// Background of the scene: white, black, grey or a colour such as '#c8c0b4'; when absent that of its run, or what training would choose
+    /// Background of the scene: white, black, grey or a colour such as '#c8c0b4'; when absent that of its run, or what training would
+    /// choose
     #[arg(long, value_name = "COLOR")]
     pub background: Option<Background>,
     #[command(flatten)]
@@ -109,7 +111,7 @@ pub fn run(args: &Args) -> Result<()> {
     let lpips = lpips(args.lpips.as_ref(), args.lpips_net)?;
     if lpips.is_none() {
         note(format_args!(
-            "LPIPS is not measured: no LPIPS weights found;  {HOW_TO_GET_LPIPS}"
+            "LPIPS is not measured: no LPIPS weights found; {HOW_TO_GET_LPIPS}"
         ));
     }
     let unseen = match (args.lpips_net, &lpips) {
@@ -171,7 +173,7 @@ pub fn run(args: &Args) -> Result<()> {
     Ok(())
 }
 
-/// Whether a recipe beside `scene`, as of an edited run, says what is behind it.
+/// Whether there is a recipe beside `scene`, as in the folder of an edited run, which gives its background.
 fn has_background(scene: &Path) -> bool {
     scene_of(scene).with_file_name("recipe.toml").is_file()
 }

@@ -44,7 +44,7 @@ const ENCODERS: [(&str, &[&str]); 2] = [
 /// How thoroughly the colours of a GIF's frame are chosen, 1 (best) to 30.
 const GIF_SPEED: i32 = 10;
 
-/// A film that is being written. It has its name only once it is complete.
+/// A film that is being written, under a temporary name until it is complete.
 pub struct FilmWriter {
     path: PathBuf,
     unfinished: PathBuf,
@@ -76,7 +76,7 @@ impl FilmWriter {
         let encoder = match kind(path) {
             Some("gif") => gif_encoder(&unfinished, width, height, fps)?,
             Some(kind) => ffmpeg(&unfinished, kind, width, height, fps)?,
-            None => return Err(Usage(format!("{}: a film ends in .mp4, .webm or .gif", path.display())).into()),
+            None => return Err(Usage(format!("{}: a film must end in .mp4, .webm or .gif", path.display())).into()),
         };
         Ok(Self {
             path: path.to_owned(),
@@ -90,15 +90,15 @@ impl FilmWriter {
         let rgb = image.to_u8();
         match self.encoder.as_mut().context("the film has ended")? {
             Encoder::Ffmpeg(child) => {
-                let input = child.stdin.as_mut().context("ffmpeg takes no frames")?;
-                // If it has ended before the film, it says why.
+                let input = child.stdin.as_mut().context("ffmpeg accepts no frames")?;
+                // If ffmpeg ended early, `end` returns its reason.
                 input
                     .write_all(&rgb)
-                    .or_else(|error| self.end().and(Err(error).context("ffmpeg takes no more frames")))
+                    .or_else(|error| self.end().and(Err(error).context("ffmpeg accepts no more frames")))
             }
             Encoder::Gif { encoder, fps, frames } => {
                 let mut frame = gif::Frame::from_rgb_speed(image.width as u16, image.height as u16, &rgb, GIF_SPEED);
-                // In whole hundredths of a second, which add up to the film's length; browsers slow down frames of less than two.
+                // In whole hundredths of a second that add up to the film's length; browsers slow down frames of less than two.
                 let ends = |frames: u32| (100.0 * frames as f32 / *fps).round() as u32;
                 frame.delay = (ends(*frames + 1) - ends(*frames)).clamp(2, u16::MAX.into()) as u16;
                 *frames += 1;
@@ -167,7 +167,7 @@ fn ffmpeg(path: &Path, kind: &str, width: u32, height: u32, fps: f32) -> Result<
     command
         .args(["-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"])
         .args(["-s", &format!("{width}x{height}"), "-r", &fps.to_string(), "-i", "-"])
-        // These codecs want even sides.
+        // These codecs need even sides.
         .args(["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2"])
         .args(*options)
         .arg(path)

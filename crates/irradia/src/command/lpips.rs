@@ -69,7 +69,7 @@ fn import(features: &Path, heads: &Path, out: Option<&Path>) -> Result<()> {
     say(format_args!("LPIPS of {net}: {}", path.display()))
 }
 
-/// The LPIPS network, `net` if given, with a note of its file; `None` if there is none.
+/// Loads the LPIPS network, `net` if given, and prints its file; `None` if there is none.
 pub fn lpips(given: Option<&PathBuf>, net: Option<LpipsNet>) -> Result<Option<Lpips>> {
     let Some(path) = find(given, net)? else { return Ok(None) };
     let lpips = Lpips::load(&path).context("LPIPS weights")?;
@@ -94,8 +94,8 @@ pub fn lpips_path(given: Option<&PathBuf>) -> Result<Option<PathBuf>> {
     find(given, None)
 }
 
-/// The file of a network other than that of `first`, which only scores: VGG's if it lies where the others are searched for, since most
-/// papers on view synthesis report it, else AlexNet's. `None` if there is none, or `given` is a file.
+/// The file of a network other than that of `first`, used for scoring only: VGG's if it is found where weights are searched for, since
+/// most papers on view synthesis report it, else AlexNet's. `None` if there is none, or `given` is a file.
 pub fn unseen_lpips_path(given: Option<&PathBuf>, first: Option<&PathBuf>) -> Option<PathBuf> {
     let folder = match named(given) {
         Some(path) if path.is_dir() => path,
@@ -109,7 +109,7 @@ pub fn unseen_lpips_path(given: Option<&PathBuf>, first: Option<&PathBuf>) -> Op
     Some(std::path::absolute(&path).unwrap_or(path))
 }
 
-/// The network in that file, with a note of it.
+/// Loads the network of [`unseen_lpips_path`], and prints which it is.
 pub fn unseen_lpips(given: Option<&PathBuf>, first: &Lpips) -> Result<Option<Lpips>> {
     let Some(path) = unseen_lpips_path(given, Some(&first.net().file_name().into())) else {
         return Ok(None);

@@ -67,16 +67,16 @@ pub struct DataArgs {
     /// Hold out every N-th view by name, none (0), or those listed in FILE; when absent the dataset's own split, or every 8th
     #[arg(long, value_name = "N|0|FILE")]
     pub holdout: Option<String>,
-    /// Folder of the photographs, if it is not where the layout of the dataset has it
+    /// Folder of the photographs, if it is not where the layout of the dataset expects it
     #[arg(long, value_name = "DIR")]
     pub images: Option<PathBuf>,
-    /// Distorted photographs are undistorted, and cut into faces where one image would show too little (undistorted); kept as their lens shows
-    /// them in place of faces (whole: the default of training on the CPU); or kept in any case (distorted)
+    /// How distorted photographs are read: undistorted, and cut into faces if one image would show too little (undistorted); kept distorted
+    /// instead of cut into faces (whole: the default for training on the CPU); or always kept distorted (distorted)
     #[arg(long, value_name = "undistorted|whole|distorted", hide_possible_values = true)]
     pub lenses: Option<Lenses>,
-    /// The photographs are frames of a film whose rows are exposed one after another (rolling shutter), during this fraction of a frame: 0.5, or
-    /// 0.5:left where the left side is exposed first. How the camera moves is taken from the poses of neighbouring frames, by the numbers in their
-    /// names. Training is on the CPU
+    /// The photographs are frames of a film whose rows are exposed one after another (rolling shutter), during this fraction of a frame:
+    /// 0.5, or 0.5:left if the left side is exposed first. The camera's motion is taken from the poses of neighbouring frames, found by the
+    /// numbers in their names. Training runs on the CPU
     #[arg(long, value_name = "FRAMES[:SIDE]")]
     pub readout: Option<String>,
     /// colmap, nerfstudio, blender, llff, nerfies, opensfm, metashape, realitycapture, polycam, record3d, nvm or bundler; detected
@@ -101,7 +101,7 @@ impl DataArgs {
         }
     }
 
-    /// As [`DataArgs::reading`], to train on `device`: the kernels of splats on GPUs are those of a pinhole.
+    /// As [`DataArgs::reading`], for training on `device`: the GPU kernels for splats support pinhole cameras only.
     pub fn training(&self, device: Option<&str>) -> Reading {
         let on_cpu = device.is_none_or(|device| device.parse() == Ok(DeviceChoice::Cpu));
         let usual = if on_cpu { Lenses::Whole } else { Lenses::Undistorted };
@@ -119,7 +119,7 @@ impl DataArgs {
     }
 }
 
-/// The device that `--device` names for rendering; said, if it is a GPU.
+/// The device that `--device` names for rendering; prints its name if it is a GPU.
 pub fn rendering_device(name: &str) -> Result<Device> {
     let device = open_device(name).map_err(by_option)?;
     if !device.is_cpu() {
@@ -128,7 +128,7 @@ pub fn rendering_device(name: &str) -> Result<Device> {
     Ok(device)
 }
 
-/// Converts an error of a request to the names of the command line.
+/// Rewrites an error of a request with the option names of the command line.
 pub fn by_option(error: RunError) -> anyhow::Error {
     match error {
         RunError::Setting { name, value, message } => {
@@ -145,7 +145,7 @@ pub fn warn(warnings: &[String]) {
     }
 }
 
-/// The line of a summary that says how the size of a file changed; `bytes` and `formats` before and after.
+/// The line of a summary that shows how the file size changed; `bytes` and `formats` before and after.
 pub fn size_line(bytes: [u64; 2], formats: [SplatFormat; 2]) -> String {
     let [before, after] = bytes.map(|bytes| bytes as f64 / 1e6);
     let [from, to] = formats;
@@ -153,7 +153,7 @@ pub fn size_line(bytes: [u64; 2], formats: [SplatFormat; 2]) -> String {
     format!("\n  size           {before:.3} MB {from} -> {after:.3} MB {to} ({percent:.1} %)")
 }
 
-/// Notes at the end of a summary, a line each.
+/// Notes at the end of a summary, one line each.
 pub fn note_lines(notes: &[String]) -> String {
     notes.iter().map(|note| format!("\n  note: {note}")).collect()
 }

@@ -18,28 +18,28 @@ use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
-/// Findings of one kind that are told in full.
+/// Maximum number of findings of one kind that are printed in full.
 const TOLD: usize = 5;
 /// Interval of plain lines.
 const LINE_EVERY: Duration = Duration::from_secs(5);
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Folders of photographs (JPEG, PNG, WebP, TIFF, HEIC, OpenEXR; masks, if any, in their folders masks) and of films, or films, which need ffmpeg;
-    /// panoramas of the whole sphere (equirectangular) are recognised and cut into faces
+    /// Folders of photographs (JPEG, PNG, WebP, TIFF, HEIC, OpenEXR; masks, if any, in their subfolders masks) and films, or film files,
+    /// which need ffmpeg; panoramas of the whole sphere (equirectangular) are recognised and cut into faces
     #[arg(required = true)]
     pub photos: Vec<PathBuf>,
     /// Folder for the dataset: the photographs and their poses in COLMAP's format. Features and matches are kept there too, and reused
     #[arg(long, value_name = "DATA", required_unless_present = "into")]
     pub out: Option<PathBuf>,
-    /// Adds the photographs to this dataset, in COLMAP's format, whose poses and cameras stay as they are
+    /// Add the photographs to this dataset in COLMAP's format, whose poses and cameras do not change
     #[arg(long, value_name = "DATA", conflicts_with = "out")]
     pub into: Option<PathBuf>,
-    /// A known distance in metres between the places from which two photographs were taken, such as a.jpg,b.jpg,1.25: brings the poses to
-    /// metres. Several are averaged, and tell how well they agree
+    /// A known distance in metres between the camera positions of two photographs, such as a.jpg,b.jpg,1.25: scales the poses to metres.
+    /// Several distances are averaged, and their agreement is reported
     #[arg(long, value_name = "A,B,METRES", value_parser = known_distance, conflicts_with = "into")]
     pub distance: Vec<KnownDistance>,
-    /// Who finds the poses: irradia, or colmap, if it is installed
+    /// Program that finds the poses: irradia, or colmap, if it is installed
     #[arg(long, value_name = "WHO", default_value = "irradia", value_enum)]
     pub poses: Poses,
     /// Maximum number of features of a photograph; when absent 8192 for up to 25 photographs, 6144 for up to 35, else 4096
@@ -54,15 +54,15 @@ pub struct Args {
 fn known_distance(text: &str) -> Result<KnownDistance, String> {
     let parts: Vec<&str> = text.split(',').map(str::trim).collect();
     let [a, b, metres] = parts[..] else {
-        return Err("is two photographs and a number of metres, such as a.jpg,b.jpg,1.25".to_owned());
+        return Err("expected two photographs and a number of metres, such as a.jpg,b.jpg,1.25".to_owned());
     };
     Ok(KnownDistance {
         photos: [a.to_owned(), b.to_owned()],
-        metres: metres.parse().map_err(|_| format!("{metres} is no number of metres"))?,
+        metres: metres.parse().map_err(|_| format!("{metres} is not a number"))?,
     })
 }
 
-/// Who finds poses.
+/// The program that finds poses.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Poses {
     Irradia,
@@ -106,7 +106,7 @@ pub fn is_unposed(data: &Path) -> bool {
 /// Poses the photographs of `input` into the folder `posed` of its run, and makes that its dataset.
 pub fn pose_first(input: &mut TrainInput, poses: Poses, anyway: bool) -> Result<()> {
     note(format_args!(
-        "{} has no poses: they are found first",
+        "{} has no poses: finding them first",
         input.data.display()
     ));
     let report = pose_into_run(input, poses, None)?;
@@ -133,8 +133,8 @@ pub fn pose_first(input: &mut TrainInput, poses: Poses, anyway: bool) -> Result<
     Ok(())
 }
 
-/// As [`pose_first`], for photographs whose poses in `dataset` are not to be used; the same views are held out. Fails if a held-out view, or more than
-/// a few of the others, find no pose, but `anyway` trains on those that do.
+/// As [`pose_first`], for photographs whose poses in `dataset` are not used; the same views are held out. Fails if no pose is found for a
+/// held-out view, or for more than a few of the others, unless `anyway`, which trains on those with poses.
 pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses, anyway: bool) -> Result<()> {
     if let Some(images) = input.reading.images.take() {
         input.data = images;
@@ -144,7 +144,7 @@ pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses, anywa
     let mut listed = HashSet::new();
     if let Some(view) = dataset.views.iter().find(|view| !listed.insert(file_name(&view.name))) {
         return Err(Usage(format!(
-            "several photographs are called {}, which tells held-out ones from others: train with --poses given, or rename them",
+            "several photographs are called {}, but held-out ones are identified by their names: train with --poses given, or rename them",
             file_name(&view.name)
         ))
         .into());
@@ -158,7 +158,7 @@ pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses, anywa
     let (train, test) = (lost(&dataset.train), lost(&dataset.test));
     if !anyway && (test > 0 || train as f64 > (1.0 - ENOUGH_POSED) * dataset.train.len() as f64) {
         return Err(Usage(format!(
-            "{train} of {} training views and {test} of {} held-out ones find no pose again; train with --poses given, or --anyway on the others",
+            "no new pose was found for {train} of {} training views and {test} of {} held-out ones; train with --poses given, or with --anyway on the others",
             dataset.train.len(),
             dataset.test.len()
         ))
@@ -183,7 +183,7 @@ pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses, anywa
 /// Poses the photographs of `input`, or `only` some, into the folder `posed` of its run, and makes that its dataset.
 fn pose_into_run(input: &mut TrainInput, poses: Poses, only: Option<HashSet<String>>) -> Result<PoseReport> {
     let posed = input.out.join("posed");
-    note(format_args!("poses are found, into {}", posed.display()));
+    note(format_args!("finding poses, which are written to {}", posed.display()));
     let data = std::mem::replace(&mut input.data, posed.clone());
     let request = PoseInput {
         mapper: poses.into(),
@@ -203,7 +203,7 @@ fn pose_with_progress(input: &PoseInput) -> Result<PoseReport> {
             .iter()
             .any(|f| f.kind == "left-out" && f.photos == [name])
     };
-    // One line a reason.
+    // One line per reason.
     let told = report.left_out.iter().filter(|left| unread(&left.name));
     for (reason, names) in by_reason(told.map(|left| (&left.name[..], &left.reason[..]))) {
         let first = names[0];
@@ -235,7 +235,7 @@ pub fn with_progress<T>(work: impl FnOnce(&(dyn Fn(PoseProgress) + Sync)) -> T) 
     result
 }
 
-/// One line a finding, at most [`TOLD`] of each kind.
+/// One line per finding, at most [`TOLD`] of each kind.
 pub fn tell_findings(findings: &[Finding], mut tell: impl FnMut(&str) -> Result<()>) -> Result<()> {
     for (i, finding) in findings.iter().enumerate() {
         let same = |other: &&Finding| other.kind == finding.kind;
@@ -260,13 +260,13 @@ fn summary(report: &PoseReport) -> String {
         .collect();
     let unit = report.scale.as_ref().map_or(String::new(), |scale| {
         let by = match scale.distances {
-            0 => format!("the places of {} photographs", scale.photos),
+            0 => format!("the recorded positions of {} photographs", scale.photos),
             1 => "a known distance".to_owned(),
             several => format!("{several} known distances"),
         };
         format!("; in metres by {by}, to {:.1} %", 100.0 * scale.scale_error)
     });
-    // COLMAP's is not asked for.
+    // COLMAP's error is not read.
     let error = match report.mean_error_px {
         0.0 => String::new(),
         pixels => format!(", mean error {pixels:.2} px"),

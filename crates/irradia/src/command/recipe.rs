@@ -36,7 +36,7 @@ pub struct ShowArgs {
     /// Fit the recipe into this number of steps
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     pub steps: Option<u64>,
-    /// Print the recipe as a file to start from instead
+    /// Print the recipe as a .toml file to start from
     #[arg(long, conflicts_with = "steps")]
     pub toml: bool,
 }
@@ -78,7 +78,7 @@ fn plan(recipe: &Recipe, steps: u64) -> String {
     let points = outline(recipe, POINTS);
     let mut text = format!("{}: {}\n{steps} steps", recipe.name, recipe.about);
     if steps != recipe.total_steps() {
-        text += &format!(" for the recipe's {}", recipe.total_steps());
+        text += &format!(" instead of the recipe's {}", recipe.total_steps());
     }
     if recipe.stage.iter().any(|stage| stage.represents == Represents::Splats) {
         text += &format!(", at most {} splats", recipe.max_splats);
@@ -203,7 +203,7 @@ fn exit(exit: Exit) -> String {
     }
 }
 
-/// The points without those at the end of a stage that equal the start of the next one.
+/// The points, without the end of each stage that equals the start of the next one.
 fn distinct(points: &[OutlinePoint], pace: f64) -> Vec<&OutlinePoint> {
     let step = |point: &OutlinePoint| (point.time / pace).round();
     let equal = |a: f64, b: f64| (a - b).abs() <= 1e-6 * a.abs();

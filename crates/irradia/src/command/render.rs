@@ -21,13 +21,13 @@ pub struct Args {
     /// Views of the dataset to render
     #[arg(long, value_enum, default_value_t = Split::Test)]
     pub split: Split,
-    /// Render this number of frames on a circle around the scene instead, or on an arc, there and back, where only one side was photographed
+    /// Render this number of frames on a circle around the scene, or back and forth on an arc if only one side was photographed
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]
     pub orbit: Option<u32>,
     /// Render a camera path: a file that the viewer or nerfstudio saved, or orbit, spiral or training (through the cameras)
     #[arg(long, value_name = "FILE|orbit|spiral|training")]
     pub path: Option<PathBuf>,
-    /// Frames of --path orbit, spiral and training
+    /// Number of frames of --path orbit, spiral and training
     #[arg(long, value_name = "N", default_value_t = 120, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     pub frames: u32,
     /// Frames per second of a film; when absent those of the path, or 30
@@ -146,7 +146,7 @@ fn write_frames(args: &Args, scene: &Scene, cameras: Vec<(String, Camera)>) -> R
     let is_film = film::kind(&args.out).is_some() || is_film_name(&args.out);
     if is_film && !args.out.is_dir() {
         return Err(Usage(format!(
-            "{}: films are .mp4, .webm or .gif, of --orbit or --path; name a folder for the frames",
+            "{}: a film needs --orbit or --path, and ends in .mp4, .webm or .gif; name a folder for the frames",
             args.out.display()
         ))
         .into());
@@ -171,7 +171,7 @@ fn write_frames(args: &Args, scene: &Scene, cameras: Vec<(String, Camera)>) -> R
             write(name, ".alpha", &alpha)?;
         }
     }
-    // One range for all frames, of inverse depth, which gives distant parts, usually most of the scene, few levels.
+    // One range of inverse depth for all frames; distant parts, usually most of the scene, get few levels of it.
     let nearest = depths.iter().flat_map(|d| &d.data).fold(0.0f32, |m, v| m.max(*v));
     for ((name, _), mut image) in cameras.iter().zip(depths) {
         for value in &mut image.data {

@@ -26,7 +26,7 @@ pub struct Args {
     /// Largest size of the page, such as 10MB or 800kB: harmonics are left out first, then splats are merged
     #[arg(long, value_name = "SIZE", value_parser = parse_size)]
     pub max: Option<u64>,
-    /// A flight of the camera, played until the page is touched: a file that the viewer or nerfstudio saved, or orbit, spiral or training
+    /// A camera path, played until the page is touched: a file that the viewer or nerfstudio saved, or orbit, spiral or training
     /// (through the cameras)
     #[arg(long, value_name = "FILE|orbit|spiral|training")]
     pub path: Option<PathBuf>,
@@ -52,10 +52,10 @@ pub(super) fn parse_size(text: &str) -> Result<u64, String> {
     Ok((number * factor) as u64)
 }
 
-/// Frames of a flight that is no file: ten seconds.
+/// Frames of a flight that is not read from a file: ten seconds.
 const FLIGHT: u32 = 300;
 
-/// The flight along `path`; a turn about the scene ends where it began.
+/// The flight along `path`; an orbit or spiral ends where it began.
 fn flight(path: &Path, scene: &Scene) -> Result<Film> {
     let mut film = film_of(path, scene, FLIGHT, None)?;
     if path.as_os_str() != "training" && !path.is_file() {
@@ -68,7 +68,7 @@ fn flight(path: &Path, scene: &Scene) -> Result<Film> {
 }
 
 impl Args {
-    /// `scene` as the page `out`, with nothing chosen.
+    /// Arguments that write `scene` as the page `out`, with all defaults.
     pub fn of(scene: &Path, out: &Path) -> Self {
         Self {
             scene: scene.to_owned(),
@@ -93,7 +93,7 @@ pub fn run(args: &Args) -> Result<()> {
     check_kept(&args.scene, &args.out)?;
     if !args.folder && SplatFormat::of(&args.out).is_ok() {
         return Err(Usage(format!(
-            "--out {}: a page is .html; irradia convert writes scenes",
+            "--out {}: the name of a page ends in .html; irradia convert writes splat files",
             args.out.display()
         ))
         .into());

@@ -32,18 +32,18 @@ pub struct Args {
     /// Built-in recipe or a .toml file
     #[arg(long, value_name = "NAME|FILE", default_value = DEFAULT_RECIPE, conflicts_with = "resume")]
     pub recipe: String,
-    /// Begin with the splats of this scene, a file or a run's folder, in the coordinates of the photographs, instead of points
+    /// Begin with the splats of this scene, a file or the folder of a run, instead of points; its coordinates must be those of the dataset
     #[arg(long, value_name = "SCENE", conflicts_with = "resume")]
     pub from: Option<PathBuf>,
-    /// Whose poses are used: those given with the photographs, or new ones by irradia, or by colmap, if it is installed. When absent those
-    /// given, unless the photographs contradict them, else irradia's
+    /// Poses to use: those given with the photographs, or new ones by irradia, or by colmap, if it is installed. When absent the given
+    /// ones, unless there are none or the photographs contradict them; then irradia's
     #[arg(long, value_name = "WHO", value_enum, conflicts_with_all = ["resume", "replay"])]
     pub poses: Option<PosesOf>,
-    /// What splats begin from where the dataset has poses and no points: points that matching its photographs finds, or, with what is given alone, random
-    /// positions
+    /// Where splats begin if the dataset has poses and no points: at points found by matching its photographs (matched), or at random
+    /// positions (given)
     #[arg(long, value_name = "WHICH", value_enum, default_value_t = PointsOf::Matched, conflicts_with_all = ["resume", "replay"])]
     pub points: PointsOf,
-    /// Train although fewer than 80 % of the photographs could be posed, or some that would be held out could not
+    /// Train even if fewer than 80 % of the photographs could be posed, or some held-out ones could not
     #[arg(long)]
     pub anyway: bool,
     /// Override one key of the recipe, such as stage.grow.params.ssim_weight=0.3
@@ -66,7 +66,7 @@ pub struct Args {
     #[arg(long, value_name = "N", value_parser = thread_count())]
     pub threads: Option<usize>,
     /// Where the scene is trained: cpu, gpu, auto (a real GPU if there is one), or a part of a GPU's name; see irradia devices. cpu when
-    /// absent, or as the run began with --resume
+    /// absent, or with --resume the device on which the run began
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<String>,
     /// Stop at this held-out PSNR
@@ -88,11 +88,12 @@ pub struct Args {
     /// LPIPS weights: a file, or a folder of them; see irradia lpips
     #[arg(long, value_name = "PATH")]
     pub lpips: Option<PathBuf>,
-    /// What is behind the scene: white, black, grey, a colour such as '#c8c0b4', or random (random colours in training, white in evaluation); when absent
-    /// white for Blender scenes and objects cut out on white, the colour of a white or black backdrop, the recipe's own for others
+    /// Background of the scene: white, black, grey, a colour such as '#c8c0b4', or random (random colours in training, white in
+    /// evaluation); when absent white for Blender scenes and objects cut out on white, the colour of a white or black backdrop, else that
+    /// of the recipe
     #[arg(long, value_name = "COLOR", conflicts_with = "resume")]
     pub background: Option<Background>,
-    /// Serve a page on which the training can be looked at and paused; see irradia view
+    /// Serve a page to watch and pause the training; see irradia view
     #[arg(long)]
     pub view: bool,
     #[command(flatten)]
@@ -101,7 +102,7 @@ pub struct Args {
     pub reading: DataArgs,
 }
 
-/// Whose poses are used.
+/// Which poses are used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum PosesOf {
     Given,
@@ -109,7 +110,7 @@ pub enum PosesOf {
     Colmap,
 }
 
-/// Whose points are used.
+/// Which points splats begin from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum PointsOf {
     Matched,
@@ -117,7 +118,7 @@ pub enum PointsOf {
 }
 
 impl PosesOf {
-    /// Who finds new ones.
+    /// The program that finds new poses; `None` for the given ones.
     fn mapper(self) -> Option<Poses> {
         match self {
             Self::Given => None,
@@ -183,7 +184,7 @@ pub fn run(args: &Args) -> Result<()> {
                 input.clone().check().map_err(by_option)?;
                 RunFolder::check_free(&input.out, input.overwrite)?;
                 let Some(mapper) = args.poses.map_or(Some(Poses::Irradia), PosesOf::mapper) else {
-                    let message = format!("{} has no poses: leave --poses given out", input.data.display());
+                    let message = format!("{} has no poses: omit --poses given", input.data.display());
                     return Err(Usage(message).into());
                 };
                 pose_first(&mut input, mapper, args.anyway)?;
@@ -203,7 +204,7 @@ fn replay(run: &Path, args: &Args) -> Result<TrainInput> {
     Ok(input)
 }
 
-/// The input of a run with what may be elsewhere now, or of another machine: its files, memory and device.
+/// The input of a run, with the settings that may differ by now or on another machine: its files, memory and device.
 fn placed_by(args: &Args, mut input: TrainInput) -> Result<TrainInput> {
     if let Some(data) = &args.data {
         input.data.clone_from(data);
@@ -250,7 +251,8 @@ fn input(args: &Args) -> Result<TrainInput> {
     })
 }
 
-/// The dataset of `input`, whose photographs have poses: with these, or with new ones if they are wanted or the photographs contradict those given.
+/// The dataset of `input`, whose photographs have poses: with the given poses, or with new ones if they are requested or the photographs
+/// contradict the given ones.
 fn with_poses(input: TrainInput, poses: Option<PosesOf>, anyway: bool) -> Result<(TrainRequest, Dataset)> {
     let given = read(input.clone())?;
     RunFolder::check_free(&input.out, input.overwrite)?;
@@ -259,7 +261,7 @@ fn with_poses(input: TrainInput, poses: Option<PosesOf>, anyway: bool) -> Result
         pose_again(&mut again, &given.1, mapper, anyway)?;
         return read(again);
     }
-    // Rendered scenes are exact, our own poses have been examined, and the splats of --from lie in the world of those given.
+    // Rendered scenes are exact, our own poses have been checked, and the splats of --from are in the world of the given poses.
     let is_sure = given.1.kind == "Blender" || poses_by(&input.data) == Some(PosesBy::Irradia) || input.from.is_some();
     if poses.is_some() || is_sure {
         return Ok(given);
@@ -275,8 +277,8 @@ fn with_poses(input: TrainInput, poses: Option<PosesOf>, anyway: bool) -> Result
         if let Some([a, b]) = found.absent.first() {
             let n = found.absent.len();
             given.1.warnings.push(format!(
-                "by the given poses {n} pairs of photographs, such as {a} and {b}, are from nearly the same place, and share nothing: parts that \
-                 look alike may be taken for one; see whether --poses irradia --anyway tells them apart"
+                "according to the given poses {n} pairs of photographs, such as {a} and {b}, are from nearly the same place, but they share \
+                 nothing: parts that look alike may be taken for one; check whether --poses irradia --anyway separates them"
             ));
         }
         return Ok(given);
@@ -285,7 +287,7 @@ fn with_poses(input: TrainInput, poses: Option<PosesOf>, anyway: bool) -> Result
     let (wrong, of) = (found.contradicting.len(), found.pairs);
     let line = format!("{wrong} of {of} pairs of photographs contradict the given poses, such as {a} and {b}");
     note(format_args!(
-        "{line}: new ones are found; --poses given keeps those given"
+        "{line}: finding new ones; --poses given keeps the given ones"
     ));
     match found_anew(input, &given.1, found.share()) {
         Ok((request, mut dataset)) => {
@@ -300,16 +302,17 @@ fn with_poses(input: TrainInput, poses: Option<PosesOf>, anyway: bool) -> Result
     }
 }
 
-/// The dataset of `input` with new poses, if they are better than those of `given`, of which the share `contradicted` of pairs is contradicted.
+/// The dataset of `input` with new poses, if the share of pairs that contradict them is less than half of `contradicted`, that of the poses
+/// of `given`.
 fn found_anew(mut input: TrainInput, given: &Dataset, contradicted: f64) -> Result<(TrainRequest, Dataset)> {
     pose_again(&mut input, given, Poses::Irradia, false)?;
     let share = check(&input)?.share();
     ensure!(
         2.0 * share < contradicted,
-        "the photographs contradict new ones as well"
+        "the photographs contradict the new ones as well"
     );
     let (request, dataset) = read(input)?;
-    // A view that was cut into faces has another name than its photograph.
+    // Views cut from a photograph as faces do not have its name.
     ensure!(dataset.test.len() == given.test.len(), "other views would be held out");
     Ok((request, dataset))
 }
@@ -320,7 +323,8 @@ fn read(input: TrainInput) -> Result<(TrainRequest, Dataset)> {
     Ok((request, dataset))
 }
 
-/// Compares the poses of the dataset of `input` with its photographs, undistorted and at a size that does not depend on that of the training.
+/// Compares the poses of the dataset of `input` with its photographs, undistorted and at a size that does not depend on that of the
+/// training.
 fn check(input: &TrainInput) -> Result<PoseCheck> {
     let mut input = input.clone();
     (input.reading.downscale, input.reading.max_side) = (1.0, Reading::default().max_side);
@@ -328,7 +332,7 @@ fn check(input: &TrainInput) -> Result<PoseCheck> {
     Ok(check_poses(&read(input)?.1))
 }
 
-/// Begins a new run on the current threads, and finishes it; `viewer` shows it meanwhile.
+/// Begins a new run on the current threads, and finishes it; `viewer` shows it while it trains.
 pub fn begin(input: TrainInput, viewer: Option<&ListenArgs>) -> Result<()> {
     let request = input.check().map_err(by_option)?;
     RunFolder::check_free(&request.input().out, request.input().overwrite)?;
@@ -340,7 +344,7 @@ fn begin_on(request: TrainRequest, dataset: Dataset, viewer: Option<&ListenArgs>
     warn(&dataset.warnings);
     warn(&request.warnings());
     if request.matches_points(&dataset) {
-        note("the dataset has no points: its photographs are matched");
+        note("the dataset has no points: matching its photographs");
     }
     let run = Run::begin_on(request, dataset).map_err(by_option)?;
     note(format_args!("background: {}", run.background()));
@@ -407,7 +411,7 @@ fn finish(mut run: Run, viewer: Option<&ListenArgs>) -> Result<()> {
     })?;
     tell(&finished)?;
     if let Some((viewer, _)) = watched.filter(|(viewer, _)| viewer.is_watched() && !stopped) {
-        note("the pages stay until they are closed, or Ctrl-C");
+        note("the pages are served until they are closed; Ctrl-C ends the program");
         viewer.wait_while_watched(&|| asked.load(Ordering::Relaxed));
     }
     Ok(())

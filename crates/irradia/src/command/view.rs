@@ -11,7 +11,7 @@ use std::sync::atomic::Ordering;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// What to look at: RUN, the file of a scene, or a dataset
+    /// What to view: RUN, a scene file, or a dataset
     pub path: PathBuf,
     /// Photographs to compare with; when absent those of the run
     #[arg(long)]
@@ -53,7 +53,7 @@ impl ListenArgs {
         Ok(viewer)
     }
 
-    /// Serves a training from now on.
+    /// Serves a running training.
     pub fn watch(&self, run: &Run) -> Result<(Viewer, Watcher)> {
         let (subject, watcher) = Subject::of_run(run);
         Ok((self.start(subject)?, watcher))
@@ -65,7 +65,7 @@ pub fn run(args: &Args) -> Result<()> {
     let stop = stop_flag();
     let subject = Subject::open(&args.path, args.data.as_deref(), &args.reading.reading())?;
     let viewer = args.listen.start(subject)?;
-    note("Ctrl-C ends it");
+    note("press Ctrl-C to stop");
     viewer.wait(&|| stop.load(Ordering::Relaxed));
     Ok(())
 }

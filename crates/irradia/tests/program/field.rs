@@ -1,4 +1,4 @@
-//! Radiance fields, like splats: trained, resumed, evaluated, rendered.
+//! Radiance fields are trained, resumed, evaluated and rendered like splats.
 
 use crate::process::*;
 use std::path::Path;
@@ -33,7 +33,7 @@ fn a_field_trains_and_is_evaluated_and_rendered_like_splats() {
     let folder = with_data();
     let line = format!("train data --recipe hashgrid --steps 300 {SMALL} --out run");
     irradia(folder.path(), &line).success();
-    // Eight views constrain novel views too little; the training views it must fit (21.8 dB; 12 before training).
+    // Eight views constrain novel views too little, but the field must fit the training views (21.8 dB; 12 before training).
     irradia(folder.path(), "eval run --data data --split train --json seen.json").success();
     let seen = json(&folder.path().join("seen.json"));
     assert!(seen["psnr"].as_f64() > Some(20.0), "{}", seen["psnr"]);

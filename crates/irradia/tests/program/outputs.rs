@@ -190,7 +190,7 @@ fn a_limit_on_splats_applies_from_the_start() {
 #[test]
 fn a_budget_covers_the_whole_recipe() {
     let folder = with_data();
-    // The limit on the steps of sparse photographs would leave a part of the budget.
+    // The limit on the steps of sparse photographs would leave a part of the budget unused.
     let ended = irradia(
         folder.path(),
         "train data --out run --budget 2s --max-splats 8000 --set sparse_visits=0",
@@ -199,7 +199,7 @@ fn a_budget_covers_the_whole_recipe() {
     assert!(ended.stderr.contains("recipe complete"), "{ended:?}");
     let run = folder.path().join("run");
     let seconds = json(&run.join("report.json"))["seconds"].as_f64().expect("a number");
-    // Other tests use the same cores at times, which is noticed only when a step is measured.
+    // Other tests use the same cores at times, and the pace adapts only when a step is measured.
     assert!((1.0..4.0).contains(&seconds), "{seconds}");
     assert_eq!(events(&run).iter().filter(|e| e["event"] == "stage_entered").count(), 2);
 }

@@ -26,7 +26,7 @@ fn bare_photographs_are_examined_posed_and_trained_on() {
     );
     let report = json(&folder.path().join("posed/pose.json"));
     assert_eq!(report["registered"].as_u64(), Some(12), "{report}");
-    // The posed photographs lie beside their poses: no other folder is needed.
+    // The posed photographs are stored beside their poses: no other folder is needed.
     irradia(folder.path(), "train posed --out first --steps 3").success();
     let trained = irradia(folder.path(), "train photos --out second --steps 3").success();
     assert!(trained.stderr.contains("no poses"), "{trained:#?}");
@@ -42,7 +42,7 @@ fn given_poses_that_photographs_contradict_are_replaced_and_others_are_on_reques
         return;
     };
     let folder = tempfile::tempdir().expect("a folder");
-    // The poses that come with it jump between the photographs 13 and 14, across which the print of the can is the same.
+    // The given poses jump between photographs 13 and 14, although both show the same print of the can.
     copy(&can.join("images"), &folder.path().join("can/images"), 24);
     copy(&can.join("sparse/0"), &folder.path().join("can/sparse/0"), 5);
     let trained = irradia(folder.path(), "train can --out run --steps 2 --max-side 120").success();

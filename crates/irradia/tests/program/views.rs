@@ -192,7 +192,7 @@ fn views_with_colliding_names_get_separate_files() {
     }
 }
 
-/// Cameras that turn by 4 degrees during the readout are trained on as what they are; without their velocities the scene is a blur.
+/// Cameras that turn by 4 degrees during the readout are trained on with their motion; without their velocities the scene is blurred.
 #[test]
 fn photographs_by_a_rolling_shutter_train_a_sharp_scene() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -208,7 +208,7 @@ fn photographs_by_a_rolling_shutter_train_a_sharp_scene() {
             .expect("PSNR")
     };
     let moving = trained("moving");
-    // The velocities of no readout are those of a camera at rest.
+    // Without a readout time the cameras are at rest.
     let path = folder.path().join("data/transforms_train.json");
     let mut transforms = json(&path);
     transforms["rolling_shutter_time"] = 0.0.into();
@@ -216,10 +216,10 @@ fn photographs_by_a_rolling_shutter_train_a_sharp_scene() {
     let at_rest = trained("at_rest");
     assert!(moving > 26.0 && moving > at_rest + 3.0, "{moving} dB and {at_rest} dB");
 
-    // A film's frames have numbers, which those of a rendered scene have, too.
+    // The names of the rendered views have numbers, like those of a film's frames.
     let said = irradia(folder.path(), "train data --out numbered --steps 2 --readout 0.1:left").success();
     assert!(!said.stderr.contains("as if exposed at once"), "{}", said.stderr);
-    // The two held-out cameras are half a turn apart: more than a first-order model bears.
+    // The two held-out cameras are half a turn apart: more than a first-order model can describe.
     let said = irradia(folder.path(), "train data --out far --steps 2 --readout 1:left").success();
     assert!(
         said.stderr
@@ -231,7 +231,7 @@ fn photographs_by_a_rolling_shutter_train_a_sharp_scene() {
         .refused(2, &["--readout 2: expected 0 to 1 frames"]);
 }
 
-/// A fisheye of 190 degrees is trained on as it is: no faces, no pixels beyond its circle, and views by a pinhole look right.
+/// A fisheye of 190 degrees is trained on without undistortion: no faces, no pixels beyond its circle, and pinhole views look right.
 #[test]
 fn photographs_of_wide_lenses_are_trained_on_and_evaluated_as_they_are() {
     let folder = tempfile::tempdir().expect("a folder");

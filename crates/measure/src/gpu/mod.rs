@@ -1,4 +1,4 @@
-//! The losses of a training step on any GPU: L1, SSIM and squares against a photograph of 8 bits, sparse depths, and the error of each
+//! The losses of a training step on any GPU: L1, SSIM and squared error against an 8-bit photograph, sparse depths, and the error of each
 //! pixel. The twin of [`crate::PhotometricLoss`] and of the metric [`crate::DepthLoss`].
 
 use crate::loss::job::Gains;
@@ -50,25 +50,25 @@ pub struct DeviceFrame<'a> {
     pub v_planes: &'a Array,
 }
 
-/// What is compared beside colours.
+/// The terms of the loss other than colours.
 #[derive(Clone, Copy, Debug)]
 pub struct Beside<'a> {
-    /// Known depths in world units; those that are not positive and finite, or lie outside the image, do not count.
+    /// Known depths in world units; those that are not positive and finite, or are outside the image, do not count.
     pub depths: &'a [DepthSample],
     /// Weight of their loss.
     pub depth_weight: f32,
-    /// Weight of the mean 1 - alpha over the pixels of the image, of which masked ones count as 0. It is part of the gradients only.
+    /// Weight of the mean of 1 - alpha over all pixels, with 0 at masked ones. This term is in the gradients, not in the values.
     pub cover_weight: f32,
-    /// Whether the plane of errors is wanted: the mean absolute difference of each pixel.
+    /// Whether to write the plane of errors: the mean absolute difference of each pixel.
     pub error: bool,
 }
 
 /// The values of the losses.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DeviceValues {
-    /// Of colours.
+    /// The loss of colours.
     pub photometric: LossValues,
-    /// Of depth, unweighted.
+    /// The loss of depth, unweighted.
     pub depth: f64,
 }
 
@@ -85,7 +85,7 @@ pub struct GpuLoss {
     samples: Array,
     totals: Array,
     readback: Readback,
-    /// Weights and number of values of what is on its way.
+    /// Weights and number of values of the comparison in flight.
     begun: (LossWeights, f64),
 }
 
@@ -93,7 +93,7 @@ impl GpuLoss {
     /// Compiles the kernels.
     ///
     /// # Errors
-    /// When the device refuses one.
+    /// When the device rejects one.
     pub fn new(gpu: Arc<Gpu>) -> Result<Self, DeviceError> {
         let array = |label| Array::zeros(&gpu, label, 0);
         let loss = Self {
@@ -132,7 +132,7 @@ impl GpuLoss {
     /// Compares `frame` and sets its gradients, without waiting for it.
     ///
     /// # Panics
-    /// When the truth is not of 8 bits, or its length differs from the target's size: a bug in the caller.
+    /// When the truth is not 8-bit, or its length differs from the target's size: a bug in the caller.
     pub fn begin(&mut self, frame: &DeviceFrame, target: &Target, weights: &LossWeights, beside: &Beside) {
         let gpu = &*self.gpu;
         let (width, height) = (target.width, target.height);
@@ -221,7 +221,7 @@ impl GpuLoss {
         self.begun = (*weights, count);
     }
 
-    /// The values of the last comparison. It waits for them alone: the device may have more to do already.
+    /// The values of the last comparison. Waits for these alone: the device may already have more work queued.
     pub fn finish(&mut self) -> DeviceValues {
         let mut totals = [0.0f32; 5];
         self.readback.take(&self.gpu, &mut totals);
@@ -251,7 +251,7 @@ fn window_words() -> [f32; 4 * (TAPS + 3)] {
     })
 }
 
-/// Samples that may count, by pixel: pixel, depth and weight.
+/// Samples that may count, sorted by pixel: pixel, depth and weight.
 fn packed(samples: &[DepthSample], pixels: usize) -> Vec<u32> {
     let good = |value: f32| value > 0.0 && value.is_finite();
     let mut counted: Vec<&DepthSample> = samples
@@ -265,7 +265,7 @@ fn packed(samples: &[DepthSample], pixels: usize) -> Vec<u32> {
         .collect()
 }
 
-/// Writes bytes as words, four each.
+/// Writes bytes as words, four bytes each.
 fn write_bytes(gpu: &Gpu, to: &mut Array, bytes: &[u8]) {
     to.reserve(gpu, bytes.len().div_ceil(4));
     let (words, rest) = bytes.as_chunks::<4>();

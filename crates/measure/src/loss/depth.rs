@@ -95,7 +95,7 @@ impl DepthLoss {
         self.run(depth, alpha, samples, kind, f64::from(weight), v_depth, v_alpha)
     }
 
-    // Single-threaded: a view has some thousand samples, which take microseconds.
+    // Single-threaded: a view has a few thousand samples, which take microseconds.
     fn run<T: Scalar>(
         &mut self,
         depth: &[T],

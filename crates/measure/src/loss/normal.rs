@@ -1,20 +1,20 @@
-//! Angle between the normals of rendered depth and given ones, such as a network's estimate (DN-Splatter, Turkulainen et al. 2024, compare
-//! the normals of splats instead; those of depth concern all splats that a pixel shows).
+//! Angle between the normals of the rendered depth and given normals, such as a network's estimate. (DN-Splatter, Turkulainen et al. 2024,
+//! compares the normals of splats instead; normals of the depth involve all splats that a pixel shows.)
 //!
-//! Symbols, for each sample: D the rendered expected depth, accumulated depth A over alpha, at four pixels left (l), right (r), above (u) and below
-//! (d); P = D ((x - cx) / fx, (y - cy) / fy, 1) the points there; m the given normal.
+//! Symbols, for each sample: D the rendered expected depth, accumulated depth A over alpha, at four pixels left (l), right (r), above (u)
+//! and below (d); P = D ((x - cx) / fx, (y - cy) / fy, 1) the points there; m the given normal.
 //!
 //! ```text
 //! n = (P_d - P_u) x (P_r - P_l), normalised;   loss = mean of 1 - n m
 //! ```
 //!
-//! A normal has no scale, and no absolute depth. Samples at edges of depth do not count.
+//! The loss constrains neither scale nor absolute depth. Samples at depth edges do not count.
 
 use glam::{DVec3, Vec2};
 use irradia_compute::simd::Scalar;
 use irradia_scene::Intrinsics;
 
-/// Relative difference of two depths of a sample from which it is at an edge.
+/// A sample is at a depth edge if two opposite depths differ by more than this fraction of the smaller one.
 const EDGE: f64 = 0.2;
 
 /// The known normal at a pixel.
@@ -69,7 +69,7 @@ impl NormalLoss {
         )
     }
 
-    // Single-threaded: a view has some thousand samples, which take less than a millisecond.
+    // Single-threaded: a view has a few thousand samples, which take less than a millisecond.
     fn run<T: Scalar>(
         &self,
         depth: &[T],
@@ -137,7 +137,7 @@ impl NormalLoss {
     }
 }
 
-/// What a sample depends on, in the order left, right, above, below.
+/// The inputs of a sample; arrays are in the order left, right, above, below.
 struct Stencil {
     pixels: [usize; 4],
     depths: [f64; 4],
@@ -146,13 +146,13 @@ struct Stencil {
 }
 
 impl Stencil {
-    /// From left to right, and from above to below.
+    /// The vectors from the left point to the right one, and from the upper point to the lower one.
     fn sides(&self) -> [DVec3; 2] {
         let [l, r, u, d] = [0, 1, 2, 3].map(|i| self.rays[i] * self.depths[i]);
         [r - l, d - u]
     }
 
-    /// The normal, and the length of the product of the sides.
+    /// The normal, and the length of the cross product of the sides.
     fn normal(&self) -> (DVec3, f64) {
         let [across, down] = self.sides();
         let product = down.cross(across);
@@ -160,7 +160,7 @@ impl Stencil {
         (product / length, length)
     }
 
-    /// `weight` times the gradient of 1 - n m for the four depths.
+    /// `weight` times the gradient of 1 - n m with respect to the four depths.
     fn vjp(&self, weight: f64) -> [f64; 4] {
         let [across, down] = self.sides();
         let (normal, length) = self.normal();
@@ -242,7 +242,7 @@ mod tests {
         let given = samples(DVec3::new(0.1, 0.5, -0.8).normalize());
         let (loss, [v_depth, v_alpha]) = value(&depth, &alpha, &given);
         assert!(loss > 0.05, "{loss}");
-        // For this seed no sample is within a step of an edge, and no opacity of the threshold.
+        // For this seed no sample is within a step of an edge, and no opacity within a step of the threshold.
         let differences = Differences::of_largest(1e-6, 1e-5);
         let by_depth = |d: &[f64]| value(d, &alpha, &given).0;
         differences.check("depth", &depth, &v_depth, some_of(depth.len()), by_depth);

@@ -22,7 +22,7 @@ pub(super) struct Rows<T> {
 impl<T: Scalar> Rows<T> {
     /// Reshapes to `rows` rows of zeros of at least `used` columns, unless they have that width already.
     pub(super) fn reshape(&mut self, rows: usize, used: usize) {
-        // Also if only the rounded width is equal: the padding may then hold values of the previous width.
+        // The exact width is compared, not the rounded one: the padding may still hold values of the previous width.
         if self.used == used {
             return;
         }
@@ -49,7 +49,7 @@ impl<T: Scalar> Rows<T> {
         self.data[from..from + self.width].as_chunks().0
     }
 
-    /// The columns of `N` rows from `row` on, mutable.
+    /// The columns of `N` rows starting at `row`, mutable.
     #[inline(always)]
     pub(super) fn columns_mut<const N: usize>(&mut self, row: usize) -> [&mut [T]; N] {
         let from = self.start + row * self.stride;

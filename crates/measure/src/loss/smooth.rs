@@ -172,7 +172,7 @@ impl<T: Real> Memory<T> {
                 let above = above.map_or(T::zero(), |above| above[x]);
                 let v_q = gain * (before + above - right[x] - down[x] - by_mean);
                 before = right[x];
-                // q is the quotient of the two: its derivative by either is q divided by it, up to sign.
+                // q is the quotient of depth and alpha: up to sign, its derivative with respect to either is q divided by that one.
                 let (v_q, counts) = (sign * v_q * q[x], q[x] != T::zero());
                 v_depth[x] += if counts { v_q / depth[x] } else { T::zero() };
                 v_alpha[x] += if counts { -v_q / alpha[x] } else { T::zero() };

@@ -1,18 +1,18 @@
 //! The loss with SSIM, streamed down a band of rows.
 //!
 //! Symbols: x render, y truth, m weight; G the window; s = x^2 + y^2 and p = xy, whose window means are all that SSIM needs
-//! beside those of x and y:
+//! besides those of x and y:
 //!
 //! ```text
 //! SSIM = (2 mu_x mu_y + C1) (2 (G p - mu_x mu_y) + C2) / ((mu_x^2 + mu_y^2 + C1) (G s - mu_x^2 - mu_y^2 + C2))
 //! ```
 //!
-//! The gradient of its sum is `G a + x (G b) + y (G c)`, with a, b / 2 and c the derivatives by mu_x, G s and
+//! The gradient of its sum is `G a + x (G b) + y (G c)`, with a, b / 2 and c the derivatives with respect to mu_x, G s and
 //! G p (stored halved): with zeros beyond the border the window is its own adjoint.
 //!
 //! Each step loads [`STEP`] rows, finishes the maps of the rows [`RADIUS`] above them and the gradient of the rows twice that far
-//! above, so that three rings of 16 rows, which stay in the cache, suffice. It handles four rows at a time, since 14 loads then
-//! serve 4 windows along y, where a single row takes 11 loads for one.
+//! above, so that rings of 16 rows, which stay in the cache, suffice. It handles four rows at a time, since 14 loads then serve
+//! 4 windows along y, whereas a single row takes 11 loads for one.
 
 use super::job::{Job, Sums};
 use super::pointwise::Differences;
@@ -200,7 +200,7 @@ fn along_y<S: Simd>(
     out
 }
 
-/// The window along x at the vector from column `column` of a padded row.
+/// The window along x at the vector that begins at column `column` of a padded row.
 #[inline(always)]
 fn along_x<S: Simd>(simd: S, padded: &[ScalarOf<S>], column: usize, window: &Window<S::F>) -> S::F {
     let from = BLOCK + column - RADIUS;
@@ -272,7 +272,7 @@ fn blur_derivatives<S: Simd>(simd: S, scratch: &mut Scratch<ScalarOf<S>>, window
     }
 }
 
-/// The gradient of the `count` rows from `above` on: the derivatives' window along y, and the pointwise parts.
+/// The gradient of the `count` rows starting at `above`: the derivatives' window along y, and the pointwise parts.
 #[inline(always)]
 fn finish<S: Simd>(
     simd: S,

@@ -41,7 +41,7 @@ impl Affine {
         Self::fit(from, to, |i| counts(i) && !clipped(&x[i]) && !clipped(&y[i]))
     }
 
-    /// The least-squares map from `from` to `to` over the pixels whose index satisfies `counts`. The identity if they are too few.
+    /// The least-squares map from `from` to `to` over the pixels whose index satisfies `counts`. The identity if there are too few.
     pub fn fit(from: &Image, to: &Image, counts: impl Fn(usize) -> bool) -> Self {
         // Normal equations of four unknowns per channel: [r, g, b, 1].
         let (mut normal, mut right, mut count) = ([[0.0f64; 4]; 4], [[0.0f64; 3]; 4], 0usize);
@@ -82,7 +82,7 @@ impl Affine {
     }
 }
 
-/// Fewest pixels that determine a map.
+/// Minimum number of pixels to fit a map.
 const LEAST_PIXELS: usize = 64;
 /// Weight of the identity, in units of squared colour per pixel: a hundredth of a grey level.
 const RIDGE: f64 = 1.6e-9;

@@ -18,21 +18,21 @@ use irradia_scene::Image;
 pub struct Evaluation {
     /// Peak signal-to-noise ratio, dB; infinite where the images are equal.
     pub psnr: f64,
-    /// The same after the affine colour map that fits the render best (gsplat's `color_correct`): without differences of exposure
-    /// and white balance.
+    /// PSNR, dB, after the best affine colour map from render to photograph (gsplat's `color_correct`), which removes differences in
+    /// exposure and white balance.
     pub psnr_corrected: f64,
     /// Mean structural similarity, at most 1.
     pub ssim: f64,
     /// Learned perceptual distance, 0 for equal images; `None` without weights or for images below [`LpipsNet::min_side`].
     pub lpips: Option<f64>,
-    /// The same of [`Networks::unseen`].
+    /// LPIPS by [`Networks::unseen`].
     pub unseen_lpips: Option<f64>,
     /// PSNR in dB over the right half of the view, after fitting exposure or pose on its left half; `None` if not requested.
     /// [`evaluate`] returns `None`.
     pub half_fit_psnr: Option<f64>,
 }
 
-/// The networks by which LPIPS is measured.
+/// The networks that compute LPIPS.
 #[derive(Clone, Copy, Default)]
 pub struct Networks<'a> {
     /// The network that a recipe's perceptual loss uses, if it has one.
@@ -42,7 +42,7 @@ pub struct Networks<'a> {
 }
 
 impl Networks<'_> {
-    /// Whether there is one.
+    /// Whether there is any network.
     pub fn any(&self) -> bool {
         self.first.is_some() || self.unseen.is_some()
     }

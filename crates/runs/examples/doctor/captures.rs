@@ -1,4 +1,4 @@
-//! Clean captures, and injuries.
+//! Clean captures, and captures with planted faults (injuries).
 
 use glam::{Quat, Vec2, Vec3};
 use irradia_runs::formats::{read_image, write_png};
@@ -9,7 +9,7 @@ use std::error::Error;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Real captures, with their photographs.
+/// Names of real captures, and the folders of their photographs.
 const REAL: [(&str, &str); 7] = [
     ("fox", "fox/images"),
     ("maryRose", "maryRose/images_4"),
@@ -22,10 +22,10 @@ const REAL: [(&str, &str); 7] = [
 /// Size of ray-traced photographs, px, and their field of view, radians.
 const SIZE: [u32; 2] = [480, 360];
 const FOV: f32 = 0.9;
-/// Photographs around a ray-traced scene.
+/// Number of photographs around a ray-traced scene.
 const RING: usize = 48;
 
-/// A picture in RGB.
+/// An RGB image.
 #[derive(Clone)]
 pub struct Picture {
     width: usize,
@@ -41,9 +41,9 @@ pub enum Source {
     Real(&'static str, &'static str),
     /// All around a ray-traced scene.
     Ring(SceneName, u64),
-    /// Around one of two groups that look alike, over to the other, and around it.
+    /// Around one of two groups that look alike, then over to the other and around it.
     Twins(u64),
-    /// On the spot in a ray-traced room.
+    /// Rotating on the spot in a ray-traced room.
     Spot(u64),
 }
 
@@ -57,7 +57,7 @@ pub struct Capture {
 
 /// What the doctor should say.
 pub enum Expected {
-    /// Nothing, of so many photographs.
+    /// Nothing, for this many photographs.
     Nothing {
         /// Their number.
         photographs: usize,
@@ -113,21 +113,22 @@ impl Capture {
         format!("{source}-{}", self.injury)
     }
 
-    /// Whether a finding of `kind` is no fault of the doctor: a consequence of the injury, or the real capture may have it.
+    /// Whether a finding of `kind` does not count as wrong: it may be a consequence of the injury, or a fault of the real capture.
     pub fn tolerates(&self, kind: &str) -> bool {
         match (self.injury, kind) {
-            // Photographs that were left out leave gaps.
+            // Photographs without a pose leave gaps.
             ("blur" | "exposure" | "zoom" | "cut" | "moving", "gap" | "open-loop") => true,
             ("gap", "open-loop") | ("loop", "gap") | ("turntable", "moving" | "contradiction" | "rotation-only") => {
                 true
             }
-            // Where the board has more matches than the scene, the model follows it, and is wrong indeed.
+            // If the board has more matches than the scene, the model follows the board and is in fact wrong.
             ("moving" | "zoom", "contradiction") | ("twin", "gap" | "open-loop" | "moving") => true,
             _ => false,
         }
     }
 
-    /// The folder of its photographs: `folder`, where they are written unless an earlier call did, or a clean capture's own.
+    /// The folder of its photographs: `folder`, into which they are written unless an earlier call did so, or the original folder of a
+    /// clean real capture.
     pub fn photographs(&self, folder: &Path) -> Result<(PathBuf, Expected), Box<dyn Error>> {
         if let (Source::Real(_, path), "clean") = (self.source, self.injury) {
             let photographs = fs::read_dir(shared(path))?.count();
@@ -276,7 +277,7 @@ impl Source {
         }
     }
 
-    /// Where each picture shows background.
+    /// The background pixels of each image.
     fn backgrounds(self) -> Result<Vec<Vec<bool>>, Box<dyn Error>> {
         if let Source::Real(..) = self {
             let is_white = |picture: Picture| {
@@ -315,7 +316,7 @@ fn traced(scene: &SynthScene, camera: &Camera, seed: usize) -> Picture {
     }
 }
 
-/// Two equal groups of patterned blocks, the second turned, in a park; a path of posts between them.
+/// Two equal groups of patterned blocks in a park, the second one rotated, with a path of posts between them.
 fn twins(seed: u64) -> (SynthScene, Vec<Camera>) {
     let mut rng = Rng::new(seed, 21);
     let block = |center: Vec3, half: Vec3, turn: f32, rng: &mut Rng| Object {
@@ -380,7 +381,7 @@ fn twins(seed: u64) -> (SynthScene, Vec<Camera>) {
 }
 
 impl Picture {
-    /// At half its size, to save time.
+    /// Reads an image at half its size, to save time.
     fn read(file: &Path) -> Result<Self, irradia_runs::formats::FormatError> {
         let divisor = 2;
         let pixels = read_image(file)?;
@@ -396,7 +397,7 @@ impl Picture {
         Ok(Self { width, height, rgb })
     }
 
-    /// Patches of all sizes.
+    /// An image of random patches of various sizes.
     fn noise(width: usize, height: usize, seed: u64) -> Self {
         let mut rng = Rng::new(seed, 5);
         let mut rgb = vec![128u8; 3 * width * height];
@@ -418,7 +419,7 @@ impl Picture {
         [0, 1, 2].map(|c| self.rgb[at + c])
     }
 
-    /// Smeared over 1.6 % of the long side, along x, along the diagonal or all around in turn.
+    /// The image blurred over 1.6 % of the longer side: along x, along the diagonal or in all directions, depending on `turn`.
     fn smeared(&self, turn: usize) -> Self {
         let length = (0.016 * self.width.max(self.height) as f64).round().max(3.0) as usize;
         let steps: Vec<(usize, usize)> = match turn % 3 {
@@ -440,7 +441,7 @@ impl Picture {
         smeared
     }
 
-    /// As with `stops` more light.
+    /// Exposes the image with `stops` more light.
     fn expose(&mut self, stops: f64) {
         for value in &mut self.rgb {
             let light = (f64::from(*value) / 255.0).powf(2.2) * stops.exp2();
@@ -448,7 +449,7 @@ impl Picture {
         }
     }
 
-    /// The middle, enlarged.
+    /// The centre of the image, enlarged by `ratio`.
     fn zoomed(&self, ratio: f64) -> Self {
         let mut zoomed = self.clone();
         let back = |v: usize, side: usize| (v as f64 + 0.5 - 0.5 * side as f64) / ratio + 0.5 * side as f64 - 0.5;
@@ -466,7 +467,7 @@ impl Picture {
         zoomed
     }
 
-    /// The lower left corner, `keep` of each side.
+    /// The lower left part of the image, with the fraction `keep` of each side.
     fn cut(&self, keep: f64) -> Self {
         let [width, height] = [self.width, self.height].map(|side| (keep * side as f64) as usize);
         let above = self.height - height;
@@ -486,7 +487,7 @@ impl Picture {
         }
     }
 
-    /// Covers a place with the same patterned board, each time elsewhere.
+    /// Covers a random part of the image with a patterned board, the same in each call.
     fn stand_in_the_way(&mut self, rng: &mut Rng) {
         let side = self.width.min(self.height) / 3;
         let board = Self::noise(side, side, 77);

@@ -1,4 +1,4 @@
-//! Measures the capture doctor: recall and precision of each diagnosis on injured captures, false alarms on clean ones.
+//! Measures the capture doctor: recall and precision of each diagnosis on captures with planted faults, false alarms on clean ones.
 //!
 //! ```text
 //! cargo run --release -p irradia-runs --example doctor -- OUT              # all, about ten minutes
@@ -6,7 +6,7 @@
 //! ```
 //!
 //! Captures are photographs of `../shared/data`, at half their size, and ray-traced ones. Each is examined twice: from pairs alone,
-//! as by `irradia doctor`, and with the model, as by `irradia pose`. A folder of OUT is one capture, to be looked at.
+//! as by `irradia doctor`, and with the model, as by `irradia pose`. Each folder in OUT is one capture, for inspection.
 
 mod captures;
 
@@ -75,7 +75,7 @@ const MODES: [&str; 2] = ["pairs", "model"];
 
 /// The findings from pairs alone, and with the model.
 fn examined(photos: &Path, folder: &Path) -> Vec<(&'static str, Vec<Finding>)> {
-    // The features are found once.
+    // Both use the same features, which are extracted once.
     let quick = DoctorInput {
         out: Some(folder.join("posed")),
         ..DoctorInput::new(photos)
@@ -136,7 +136,7 @@ fn score(expected: &Expected, capture: &Capture, findings: &[Finding], mut add: 
         }
         Expected::Capture { kinds } => {
             let found = findings.iter().any(|finding| kinds.contains(&finding.kind));
-            // Findings of other sets' injuries that this capture does not have.
+            // Findings of faults that this capture does not have are counted below.
             add(
                 capture.injury,
                 Score {
@@ -147,7 +147,7 @@ fn score(expected: &Expected, capture: &Capture, findings: &[Finding], mut add: 
             );
         }
     }
-    // An injury of the whole that was not made is wrong wherever it is found.
+    // A finding about a whole capture is wrong wherever that fault was not planted.
     const WHOLE: [(&str, &str); 6] = [
         ("gap", "gap"),
         ("open-loop", "loop"),

@@ -1,9 +1,9 @@
-//! A scene made small: the splats that matter least are removed, and the others trained to take their place and to suit the file.
+//! Compaction of a scene: the splats that matter least are removed, and the others are trained to replace them and to suit the file format.
 //!
-//! What matters is measured ([`irradia_splat::contribution`]). After the removal the scene takes the way through the format twice: first
-//! its harmonics stay as the file holds them, then everything but colours and opacities, and what is still free is trained to make
-//! up for what was rounded. SOG's palette and codebooks hold what came from them exactly, so that
-//! the last way loses next to nothing.
+//! How much a splat matters is measured ([`irradia_splat::contribution`]). After the removal the scene is encoded and decoded twice: first
+//! its harmonics are frozen at their decoded values, then everything but colours and opacities, and the remaining parameters are trained to
+//! compensate for the rounding. SOG's palette and codebooks represent values that came from them exactly, so the final encoding loses next
+//! to nothing.
 
 mod between;
 mod tries;
@@ -15,12 +15,12 @@ use irradia_formats::{SplatFormat, WriteOptions, splat_file_size};
 use std::path::PathBuf;
 use tries::{Measure, Tries};
 
-/// What a compacted scene may have at most.
+/// The size limit of a compacted scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum CompactTarget {
-    /// Splats.
+    /// Maximum number of splats.
     Splats(usize),
-    /// Bytes of the file.
+    /// Maximum size of the file, bytes.
     Bytes(u64),
 }
 
@@ -33,26 +33,26 @@ pub struct CompactInput {
     pub data: PathBuf,
     /// The file to write; its name selects the format.
     pub out: PathBuf,
-    /// What the result may have at most. This or `keep_psnr` is needed.
+    /// The size limit. Either this or `keep_psnr` is required.
     pub target: Option<CompactTarget>,
-    /// What the result may lose on the training views, dB: without a target the smallest scene that holds it, with one at least as many
-    /// splats as this takes.
+    /// PSNR that the result may lose on the training views, dB. Without a target, the smallest scene within this loss is searched; with a
+    /// target, more splats are kept if this loss requires them.
     pub keep_psnr: Option<f64>,
     /// Training steps of a try.
     pub steps: u64,
     /// How the dataset is read.
     pub reading: Reading,
-    /// How the file is written; what is `None` is chosen for the number of splats.
+    /// How the file is written; options that are `None` are chosen for the number of splats.
     pub write: WriteOptions,
     /// Random seed.
     pub seed: u64,
 }
 
 impl CompactInput {
-    /// Usual steps of a try. On lund_door at a thirtieth of the bytes 1,500 gain 0.3 dB on training views, and nothing on held-out ones.
+    /// Default steps of a try. On lund_door at a thirtieth of the bytes, 1,500 gain 0.3 dB on training views and nothing on held-out ones.
     pub const STEPS: u64 = 600;
 
-    /// Makes the scene `scene`, trained on `data`, as small as `keep_psnr` 0.2 allows.
+    /// A request to make the scene `scene`, trained on `data`, as small as a `keep_psnr` of 0.2 allows.
     pub fn new(scene: impl Into<PathBuf>, data: impl Into<PathBuf>, out: impl Into<PathBuf>) -> Self {
         Self {
             scene: scene.into(),
@@ -70,7 +70,7 @@ impl CompactInput {
     fn check(&self) -> Result<SplatFormat, RunError> {
         let format = SplatFormat::of(&self.out)?;
         if !format.is_readable() {
-            let message = format!("{format} files hold no splats to be read again: choose another format");
+            let message = format!("{format} files cannot be read back as splats: choose another format");
             return Err(RunError::setting("out", self.out.display(), message));
         }
         if self.steps < 10 {
@@ -91,16 +91,16 @@ impl CompactInput {
     }
 }
 
-/// What became of a scene: before and after.
+/// The result of a compaction; pairs are before and after.
 #[derive(Clone, Debug)]
 pub struct Compacted {
     /// Formats of the files.
     pub formats: [SplatFormat; 2],
-    /// Bytes of the files.
+    /// Sizes of the files, bytes.
     pub bytes: [u64; 2],
-    /// Splats.
+    /// Numbers of splats.
     pub splats: [usize; 2],
-    /// Splats with harmonics above degree 0, after.
+    /// Number of splats with harmonics above degree 0, after.
     pub with_harmonics: usize,
     /// Mean PSNR of training views, dB.
     pub psnr: [f64; 2],
@@ -110,14 +110,14 @@ pub struct Compacted {
     pub notes: Vec<String>,
 }
 
-/// What [`compact`] does.
+/// Progress of [`compact`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum CompactEvent {
     /// A step of a try was made.
     Step {
-        /// Steps made, and of this try.
+        /// Steps made, and all steps of this try.
         steps: [u64; 2],
-        /// Splats now, and at the end of the try.
+        /// Splats now, and at the end of this try.
         splats: [usize; 2],
     },
     /// A try ended.
@@ -131,10 +131,10 @@ pub enum CompactEvent {
     },
 }
 
-/// Compacts a scene and writes it; nothing is written before the end. `see` follows what happens.
+/// Compacts a scene and writes it; nothing is written before the end. `see` receives the progress.
 ///
 /// # Errors
-/// When a setting is out of range, scene or dataset cannot be read, the scene is no splats, no scene is small enough, or the output
+/// When a setting is out of range, scene or dataset cannot be read, the scene has no splats, the target cannot be reached, or the output
 /// cannot be written.
 pub fn compact(input: &CompactInput, see: &mut dyn FnMut(CompactEvent)) -> Result<Compacted, RunError> {
     let format = input.check()?;
@@ -174,7 +174,7 @@ pub fn compact(input: &CompactInput, see: &mut dyn FnMut(CompactEvent)) -> Resul
         None => tries.smallest(1, before - input.keep_psnr.unwrap_or_default(), see)?,
     };
     if let Some(loss) = input.keep_psnr.filter(|loss| found.psnr < before - loss) {
-        notes.push(format!("no try lost as little as {loss} dB: this one has all splats"));
+        notes.push(format!("every try lost more than {loss} dB: all splats are kept"));
     }
     let model = tries.model(&found.splats);
     let held_out_after = measure.of_held_out(&model)?;

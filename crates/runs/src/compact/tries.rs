@@ -1,4 +1,4 @@
-//! Tries: a number of splats, trained for the format and measured.
+//! Tries: scenes with a given number of splats, trained for the format and measured.
 
 use super::{CompactEvent, CompactInput};
 use crate::convert::in_world;
@@ -17,28 +17,28 @@ use irradia_train::socket::Vignette;
 use irradia_train::{Recipe, TrainOptions, Trainer};
 use std::sync::Arc;
 
-/// The recipe by which splats are trained further.
+/// The recipe for training the splats further.
 const RECIPE: &str = include_str!("recipe.toml");
-/// Rounds in which splats are removed.
+/// Number of rounds in which splats are removed.
 const ROUNDS: u32 = 6;
-/// Training views on which a loss is measured, at most.
+/// Maximum number of training views on which PSNR is measured.
 const MEASURED_VIEWS: usize = 32;
-/// Views by which contributions are found, at most.
+/// Maximum number of views from which contributions are computed.
 const JUDGING_VIEWS: usize = 160;
-/// How much of a scene its file has room for.
+/// How finely the file represents a scene.
 #[derive(Clone, Copy)]
 struct Grain {
-    /// Share of the splats whose harmonics are kept: those where they show most.
+    /// Share of the splats that keep their harmonics: those where harmonics are most visible.
     shown: f64,
     /// Entries of the palette of harmonics per splat.
     palette: f64,
-    /// Steps of SOG; its palette is that per splat.
+    /// Quantisation of SOG; its number of palette entries is replaced according to `palette`.
     detail: SogDetail,
 }
 
-/// What costs the fewest bytes beside splats: steps that are not seen after the training for them. With half of the harmonics kept fox_colmap
-/// loses 0.1 dB for 3 % of the bytes, more than splats would cost; on lund_door with 34,000 splats a palette of 0.1 takes 713 kB, not 612,
-/// for 0.02 dB.
+/// The fewest bytes per splat: quantisation that is invisible after training for it. With only half of the harmonics kept, fox_colmap
+/// loses 0.1 dB for 3 % of the bytes, more than removing splats would cost; on lund_door with 34,000 splats a palette of 0.1 takes 713 kB
+/// instead of 612 and gains 0.02 dB.
 const COARSE: Grain = Grain {
     shown: 0.8,
     palette: 0.03,
@@ -49,8 +49,8 @@ const COARSE: Grain = Grain {
         numbers: 128,
     },
 };
-/// Where all splats fit with bytes to spare, the finest of these that fits. A tenth of the bytes of fox_colmap and lund_door, held-out
-/// PSNR with [`COARSE`] (6.3 and 6.1 %): -0.15 and -0.21 dB.
+/// If all splats fit with bytes to spare, the finest of these that fits is used. At a target of a tenth of the bytes of fox_colmap and
+/// lund_door, [`COARSE`] (6.3 and 6.1 % of the bytes) loses 0.15 and 0.21 dB of held-out PSNR.
 const FINER: [Grain; 2] = [
     Grain {
         shown: 1.0,
@@ -69,16 +69,17 @@ const FINEST: SogDetail = SogDetail {
     rotation_bits: 8,
     numbers: 256,
 };
-/// Share of the wanted bytes that all splats may take before their training to count as fitting with bytes to spare.
+/// All splats fit with bytes to spare if they take at most this share of the target before their training.
 const SPARE: f64 = 0.97;
-/// Tries to keep within a number of bytes: where the first three miss, harmonics or rounding cost more than the line of bytes by splats says.
+/// Maximum number of tries to meet a target in bytes: if the first three miss it, harmonics or rounding cost more than the linear model of
+/// bytes by splats predicts.
 const MISSES: u32 = 6;
-/// Tries of a search for the smallest scene.
+/// Maximum number of tries in the search for the smallest scene.
 const SEARCHES: u32 = 6;
-/// Neighbouring tries of a search that are not told apart: counts that differ by less than this factor.
+/// The search ends when its bounds differ by less than this factor.
 const CLOSE: f64 = 1.1;
 
-/// How splats compare with the photographs.
+/// Measures the PSNR of splats against the photographs.
 pub(super) struct Measure {
     dataset: Dataset,
     options: RenderOptions,
@@ -86,7 +87,7 @@ pub(super) struct Measure {
 }
 
 impl Measure {
-    /// By the photographs of `dataset`, whose lenses have this vignette.
+    /// Measures against the photographs of `dataset`, whose lenses have this vignette.
     pub fn new(dataset: &Dataset, options: RenderOptions, vignette: Option<Vignette>) -> Self {
         Self {
             dataset: dataset.clone(),
@@ -100,7 +101,7 @@ impl Measure {
         self.vignette.as_ref()
     }
 
-    /// Mean PSNR over training views, evenly chosen, dB.
+    /// Mean PSNR over evenly spaced training views, dB.
     pub fn of(&self, model: &Model) -> Result<f64, RunError> {
         let train = &self.dataset.train;
         let step = train.len().div_ceil(MEASURED_VIEWS).max(1);
@@ -125,7 +126,7 @@ impl Measure {
     }
 }
 
-/// A scene as its file will hold it.
+/// A scene as decoded from its file.
 pub(super) struct Found {
     pub splats: Splats,
     pub bytes: u64,
@@ -142,7 +143,7 @@ impl Found {
     }
 }
 
-/// What all tries have in common.
+/// The parameters that all tries share.
 pub(super) struct Tries<'a> {
     input: &'a CompactInput,
     format: SplatFormat,
@@ -151,13 +152,13 @@ pub(super) struct Tries<'a> {
     recipe: Recipe,
     options: RenderOptions,
     world_from_dataset: Similarity,
-    /// The smallest scene so far that was good enough, from which the next try begins.
+    /// The splats with which the next try begins: those of the smallest scene so far that was good enough.
     begin: Splats,
     grain: Grain,
 }
 
 impl<'a> Tries<'a> {
-    /// Of `splats`, those of `scene`, trained on `dataset`.
+    /// Tries that begin with `splats`, those of `scene`, and train on `dataset`.
     pub fn new(
         input: &'a CompactInput,
         format: SplatFormat,
@@ -185,7 +186,7 @@ impl<'a> Tries<'a> {
         })
     }
 
-    /// The next try begins with all splats of `scene`, as the first did.
+    /// Makes the next try begin with all splats of `scene`, like the first one.
     pub fn begin_again(&mut self, scene: &Scene) {
         if let Some(splats) = scene.model.splats() {
             self.begin = splats.clone();
@@ -193,12 +194,12 @@ impl<'a> Tries<'a> {
         self.grain = COARSE;
     }
 
-    /// `splats` to be rendered.
+    /// `splats` for rendering.
     pub fn model<'s>(&self, splats: &'s Splats) -> Model<'s> {
         Model::of_splats(splats)
     }
 
-    /// `splats` to be written.
+    /// `splats` for writing.
     pub fn cloud(&self, splats: &Splats) -> GaussianCloud {
         GaussianCloud {
             antialiased: self.options.antialias,
@@ -207,7 +208,7 @@ impl<'a> Tries<'a> {
         }
     }
 
-    /// How `count` splats are written.
+    /// The options for writing `count` splats.
     fn write_options(&self, count: usize) -> WriteOptions {
         let detail = SogDetail {
             palette: ((count as f64 * self.grain.palette) as usize).clamp(64, 65_536),
@@ -219,7 +220,7 @@ impl<'a> Tries<'a> {
         }
     }
 
-    /// What the file will hold of `splats`, and its bytes.
+    /// Encodes and decodes `splats`; returns the decoded splats and the size of the file in bytes.
     fn through(&self, splats: &Splats) -> Result<(Splats, u64), RunError> {
         let options = self.write_options(splats.len());
         let (cloud, bytes) = through_format(self.format, &self.cloud(splats), &options)?;
@@ -235,7 +236,7 @@ impl<'a> Tries<'a> {
         contributions(splats, &cameras, &self.options, seed)
     }
 
-    /// `count` splats, trained.
+    /// A scene of `count` splats, trained.
     pub fn with(&self, count: usize, see: &mut dyn FnMut(CompactEvent)) -> Result<Found, RunError> {
         let options = TrainOptions {
             seed: self.input.seed,
@@ -251,7 +252,7 @@ impl<'a> Tries<'a> {
             let removed = trainer.clock.time / self.recipe.stage[0].steps as f64;
             if rounds < ROUNDS && removed >= f64::from(rounds) / f64::from(ROUNDS) && count < first {
                 rounds += 1;
-                // By the same factor in each round.
+                // The number decreases by the same factor in each round.
                 let share = (count as f64 / first as f64).powf(f64::from(rounds) / f64::from(ROUNDS));
                 let most = ((first as f64 * share).round() as usize).max(count);
                 let change = self
@@ -290,16 +291,16 @@ impl<'a> Tries<'a> {
         Ok(found)
     }
 
-    /// As many splats as fit into `most` bytes, trained.
+    /// A scene of as many splats as fit into `most` bytes, trained.
     ///
     /// # Errors
-    /// When not even a few do.
+    /// When not even a few splats fit.
     pub fn within(&mut self, most: u64, see: &mut dyn FnMut(CompactEvent)) -> Result<Found, RunError> {
         let first = self.begin.len();
         let mut order = SplatState::new(self.begin.clone());
         let judged = self.judge(&order.splats, self.input.seed);
         hide_harmonics(&mut order.splats, &judged.weight, self.grain.shown);
-        // Bytes are nearly linear in the number of splats: two points on the line, then its place at the limit.
+        // Bytes are nearly linear in the number of splats: a line through two points predicts the number at the limit.
         let bytes_with = |tries: &Self, count: usize| -> Result<f64, RunError> {
             let mut state = order.clone();
             keep(&mut state, &judged.change, count);
@@ -334,7 +335,8 @@ impl<'a> Tries<'a> {
             if found.bytes <= most {
                 return Ok(found);
             }
-            // What is left is trained further with a little less, and at each miss with more of it less; what a file has beside its splats stays.
+            // The remaining splats are trained further, minus a few, and minus more after each miss; the part of a file that does not
+            // depend on the number of splats stays.
             let excess = 1.1 * f64::from(1 << miss) * (found.bytes - most) as f64 / slope;
             let had = found.splats.len() as f64;
             count = (had - excess.max(1.0)).max(0.5 * had) as usize;
@@ -343,12 +345,12 @@ impl<'a> Tries<'a> {
         Err(RunError::setting(
             "target",
             format!("{most} bytes"),
-            format!("no {} file of this scene is so small", self.format),
+            format!("the scene cannot be made this small as {}", self.format),
         ))
     }
 
-    /// The smallest scene of at least `fewest` splats with at least `least` PSNR, by bisection; the largest that was tried if there is
-    /// none.
+    /// The smallest scene of at least `fewest` splats with a PSNR of at least `least` dB, by bisection; one of all splats if no try reaches
+    /// that PSNR.
     pub fn smallest(
         &mut self,
         fewest: usize,
@@ -388,7 +390,7 @@ fn keep(state: &mut SplatState, score: &[f64], count: usize) {
     state.gather(&order);
 }
 
-/// Sets harmonics above degree 0 to zero but for the `share` of the splats where they show most: by the light that they change.
+/// Sets harmonics above degree 0 to zero, except for the `share` of the splats where they are most visible, by the light that they change.
 fn hide_harmonics(splats: &mut Splats, weight: &[f64], share: f64) {
     let planes = splats.sh.count();
     let energy = |i: usize| (3..planes).map(|c| f64::from(splats.sh.get(c, i)).powi(2)).sum::<f64>();

@@ -1,4 +1,4 @@
-//! From photographs to models, once with such features.
+//! One attempt to find poses: from photographs to models with one setting of features.
 
 use super::capture::Capture;
 use super::known::KnownPoses;
@@ -12,32 +12,32 @@ use irradia_sfm::map::{
 use irradia_sfm::matching::PairOptions;
 use std::path::Path;
 
-/// Frames after each frame of a film that it is matched with in any case.
+/// Number of following frames with which each frame of a film is always matched.
 const FILM_SUCCESSORS: usize = 10;
-/// Neighbours that contradict the model of few photographs, from which on it may be wrong.
+/// Minimum number of contradicting pairs of neighbours for the model of few photographs to be suspected of being wrong.
 const CONTRADICTED: usize = 2;
 
-/// Up to so many photographs, as many as are chosen of a film, are matched along epipolar lines: of 984 frames of two films, that took seven minutes for a model of 454 in place
-/// of 507, since what joins their parts was not filmed.
+/// Maximum number of photographs that are matched along epipolar lines, equal to the maximum number of frames chosen from films. For 984
+/// frames of two films it took seven minutes and gave a model of 454 instead of 507, since what joins their parts was not filmed.
 const MOST_GUIDED: usize = 300;
 
 /// Photographs with features and matches.
 pub(super) struct Matched<'a> {
     pub work: Work<'a>,
-    /// Of the photographs that have features.
+    /// The photographs that have features, as the mapper needs them.
     pub infos: Vec<PhotoInfo>,
     pub pairs: Vec<PairMatches>,
 }
 
-/// What was found.
+/// The result of one attempt.
 pub(super) struct Attempt<'a> {
     pub matched: Matched<'a>,
     pub reconstruction: Reconstruction,
 }
 
 impl<'a> Matched<'a> {
-    /// Features and matches of the photographs of `work`. Of those in which what stands still is `masked`, some are left at the edges of the masks: their matches
-    /// are left out.
+    /// Finds features and matches of the photographs of `work`. If what stands still is `masked`, some still features remain at the edges
+    /// of the masks: their matches are removed.
     pub fn find(mut work: Work<'a>, capture: &Capture, masked: bool, clock: &mut Clock) -> Result<Self, RunError> {
         work.find_features()?;
         clock.end("features");
@@ -81,7 +81,8 @@ impl<'a> Matched<'a> {
         };
         let unmatched = reconstruction.absent_and_unmatched(pairs);
         if is_new && !unmatched.is_empty() {
-            // Of many photographs not all pairs are matched: where too much is absent, the rest must be as well.
+            // With many photographs, not all pairs are matched at first: if too many matches are absent, the remaining pairs are matched
+            // as well.
             let mut all: Vec<[u32; 2]> = pairs.iter().map(|pair| pair.photos).chain(unmatched).collect();
             all.sort_unstable();
             *pairs = work.matches_of(all)?;
@@ -97,18 +98,18 @@ impl<'a> Matched<'a> {
 }
 
 impl<'a> Attempt<'a> {
-    /// Photographs with a pose in the largest model.
+    /// Number of photographs with a pose in the largest model.
     pub fn registered(&self) -> usize {
         self.reconstruction.registered()
     }
 
-    /// Neighbours that contradict the model of few photographs.
+    /// Number of pairs of neighbours that contradict the model of few photographs.
     fn contradictions(&self) -> usize {
         let Matched { work, infos, .. } = &self.matched;
         self.reconstruction.contradictions(infos, work.features())
     }
 
-    /// For the report.
+    /// This attempt's entry in the report.
     pub fn report(&self) -> AttemptReport {
         AttemptReport {
             max_features: self.matched.work.sift().max_features,
@@ -118,8 +119,8 @@ impl<'a> Attempt<'a> {
         }
     }
 
-    /// Why a second attempt is made: too few photographs have a pose, or few photographs contradict their model. Parts that look alike and are
-    /// mapped apart would only be taken for one another again.
+    /// Why a second attempt is made: too few photographs have a pose, or pairs of few photographs contradict the model. `None` if parts
+    /// that look alike were mapped separately: a second attempt would only confuse them again.
     pub fn falls_short(&self) -> Option<String> {
         let photos = self.matched.work.photos().len();
         if self.reconstruction.apart.is_some() {
@@ -132,7 +133,7 @@ impl<'a> Attempt<'a> {
         (pairs >= CONTRADICTED).then(|| format!("{pairs} pairs of photographs contradict the others"))
     }
 
-    /// The same photographs, to be matched with frontal descriptors and along epipolar lines.
+    /// The same photographs for a second attempt, with frontal descriptors and matching along epipolar lines.
     pub fn again(&self, wanted: Option<usize>, out: &Path) -> Work<'a> {
         let photos = self.matched.work.photos().len();
         let posed = self.reconstruction.models.first().map(|model| &model.poses);
@@ -140,8 +141,8 @@ impl<'a> Attempt<'a> {
         self.matched.work.again(wanted, &left_out.collect::<Vec<_>>(), out)
     }
 
-    /// Whether this second attempt is to be preferred to the `first`. Its weak matches make wrong models of few photographs (3 of 20 of a room that was seen from
-    /// one place, two opposite walls of a house as one) and add single ones of what looks alike.
+    /// Whether this second attempt replaces the `first`. Its weak matches can give wrong models of few photographs (3 of 20 of a room
+    /// photographed from one place, two opposite walls of a house as one) and add single photographs of parts that look alike.
     pub fn replaces(&self, first: &Self) -> bool {
         let photos = self.matched.work.photos().len();
         if self.registered() >= photos.div_ceil(2).max(first.registered() + photos.div_ceil(20)) {
@@ -154,12 +155,12 @@ impl<'a> Attempt<'a> {
     }
 }
 
-/// Whether so many photographs are matched along epipolar lines in a second attempt.
+/// Whether this many photographs are matched along epipolar lines in a second attempt.
 pub(super) fn may_be_guided(photos: usize) -> bool {
     photos <= MOST_GUIDED
 }
 
-/// How many of so many photographs should have a pose.
+/// How many of this many photographs should have a pose.
 fn enough(photos: usize) -> usize {
     match photos {
         ..=FEW_PHOTOS => photos,
@@ -167,9 +168,10 @@ fn enough(photos: usize) -> usize {
     }
 }
 
-/// Models of photographs without poses. In a second attempt, matches along epipolar lines join where too few photographs have a pose without
-/// them: where a model holds, these weak matches may break it, and only photographs without a pose are registered by them. 201 frames of a copier, 145 with a pose, took twelve
-/// models of 23 to 65 frames and 195 s otherwise, of which none was used. Narrow views are of the first attempt.
+/// Models of photographs without known poses. In a second attempt, if too few photographs have a pose, matches along epipolar lines are
+/// added. If the model contains half of the photographs, these weak matches might break it, so they only register photographs without a
+/// pose: mapping everything again took 195 s for 201 frames of a copier, 145 of them with a pose, and gave twelve models of 23 to 65
+/// frames, none of which was used. Narrow views are tried in the first attempt only.
 fn models(
     work: &Work,
     infos: &[PhotoInfo],

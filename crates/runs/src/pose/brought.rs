@@ -1,4 +1,4 @@
-//! The files of photographs that are brought into the dataset, and what an earlier call brought.
+//! The files of photographs that are brought into the dataset, and the record of those that an earlier call brought.
 
 use crate::RunError;
 use crate::folder::to_json;
@@ -10,24 +10,24 @@ use std::path::{Component, Path};
 
 /// The record of what was brought, in the folder of the dataset.
 const RECORD: &str = "files.json";
-/// Where files go that the capture does not have any more: they may be the last ones.
+/// Folder for files that the capture no longer has: they may be the last copies.
 const UNUSED: &str = "unused";
-/// Where photographs lie.
+/// Folder of photographs.
 pub(super) const IMAGES: &str = "images";
-/// Where masks lie.
+/// Folder of masks.
 pub(super) const MASKS: &str = "masks";
 
-/// Paths in the folder of the dataset, with `/`.
+/// Paths relative to the folder of the dataset, with `/`.
 type Files = BTreeSet<String>;
 
-/// A file that belongs to a photograph, and where it lies in the dataset.
+/// A file that belongs to a photograph, and its place in the dataset.
 struct Belonging<'a> {
     from: &'a Path,
     folder: &'static str,
     name: String,
 }
 
-/// A photograph and what lies beside it: its mask and its maps of depth and normals, under its name with their own extension appended.
+/// The files of a photograph: itself, and its mask and its maps of depth and normals, under its name with their own extension appended.
 fn belongings(photo: &PhotoEntry) -> impl Iterator<Item = Belonging<'_>> {
     let beside = [
         (&photo.mask, MASKS),
@@ -55,13 +55,13 @@ impl Belonging<'_> {
         format!("{}/{}", self.folder, self.name)
     }
 
-    /// Whether it is the file `to` already, and not a link or copy.
+    /// Whether it already is the file `to`, and not a hard link or copy of it.
     fn is(&self, to: &Path) -> bool {
         same_file(self.from, to)
     }
 
-    /// Brings it into `folder`, which is created: as a hard link where the file system allows it, else, and masks, which users edit in a dataset, as a copy.
-    /// Another file of that name is put away: it may be the only one.
+    /// Brings the file into `folder`, which is created: as a hard link if the file system allows it, otherwise as a copy. Masks are always
+    /// copied, since users edit them in a dataset. Another file of that name is put away: it may be the only copy.
     fn bring(&self, out: &Path, folder: &str) -> Result<(), RunError> {
         let name = format!("{folder}/{}", self.name);
         let to = &out.join(&name);
@@ -78,7 +78,7 @@ impl Belonging<'_> {
     }
 }
 
-/// Whether two files hold the same: links of one file were written at the same time, and copies are compared.
+/// Whether two files have the same content. Files of equal size and modification time count as links of one file; others are compared.
 fn has_bytes_of(one: &Path, other: &Path) -> Result<bool, RunError> {
     let metadata = |path: &Path| fs::metadata(path).map_err(RunError::io("read", path));
     let bytes = |path: &Path| fs::read(path).map_err(RunError::io("read", path));
@@ -87,7 +87,8 @@ fn has_bytes_of(one: &Path, other: &Path) -> Result<bool, RunError> {
     Ok(a.len() == b.len() && (is_link || bytes(one)? == bytes(other)?))
 }
 
-/// Brings a photograph, its mask and its maps of depth and normals into the folders `images`, `masks`, `depths` and `normals` of the dataset.
+/// Brings a photograph, its mask and its maps of depth and normals into the folders `images`, `masks`, `depths` and `normals` of the
+/// dataset.
 pub(super) fn bring_photo(out: &Path, photo: &PhotoEntry) -> Result<(), RunError> {
     belongings(photo).try_for_each(|file| file.bring(out, file.folder))
 }
@@ -101,7 +102,7 @@ pub(super) fn bring_panorama(out: &Path, panorama: &PhotoEntry) -> Result<(), Ru
     })
 }
 
-/// Puts away what an earlier call brought beside photographs and `photos` do not have: masks that were taken away would still hide what they hid.
+/// Puts away masks and maps that an earlier call brought and `photos` no longer have: masks removed by the user would still hide pixels.
 pub(super) fn clear_beside(out: &Path, photos: &[PhotoEntry]) -> Result<(), RunError> {
     let has: Files = photos.iter().flat_map(belongings).map(|file| file.file()).collect();
     let stale = before(out).into_iter();
@@ -111,10 +112,11 @@ pub(super) fn clear_beside(out: &Path, photos: &[PhotoEntry]) -> Result<(), RunE
     )
 }
 
-/// Puts away what an earlier call brought and `posed` do not have, unless photographs were `added`, and records what is there now.
+/// Puts away files that an earlier call brought and that do not belong to `posed`, unless photographs were `added`, and records the current
+/// files.
 pub(super) fn record(out: &Path, posed: &[&PhotoEntry], added: bool) -> Result<(), RunError> {
     let before = before(out);
-    // What lay in the dataset from the start stays.
+    // Files that were in the dataset from the start are not recorded, and stay.
     let brought = |file: &Belonging| before.contains(&file.file()) || !file.is(&out.join(file.file()));
     let files = posed.iter().flat_map(|photo| belongings(photo));
     let mut now: Files = files.filter(brought).map(|file| file.file()).collect();
@@ -133,7 +135,8 @@ fn before(out: &Path) -> Files {
         .unwrap_or_default()
 }
 
-/// Moves `files` of the dataset, those that are there, into [`UNUSED`], and removes folders that are empty then. What a record names outside of the dataset is ignored.
+/// Moves those of the dataset's `files` that exist into [`UNUSED`], where `a.2.png` stands beside an earlier `a.png`, and removes folders
+/// that become empty. Paths that lead outside of the dataset are ignored.
 pub(super) fn put_away(out: &Path, files: impl Iterator<Item = String>) -> Result<(), RunError> {
     let is_inside = |file: &str| {
         Path::new(file)
@@ -145,9 +148,14 @@ pub(super) fn put_away(out: &Path, files: impl Iterator<Item = String>) -> Resul
         if !is_inside(&file) || !path.is_file() {
             continue;
         }
-        let to = out.join(UNUSED).join(&file);
-        let folder = to.parent().expect("in a folder");
+        let wanted = out.join(UNUSED).join(&file);
+        let folder = wanted.parent().expect("in a folder");
         fs::create_dir_all(folder).map_err(RunError::io("create", folder))?;
+        let extension = wanted.extension().unwrap_or_default().to_string_lossy();
+        let to = std::iter::once(wanted.clone())
+            .chain((2u32..).map(|n| wanted.with_extension(format!("{n}.{extension}"))))
+            .find(|to| !to.exists())
+            .expect("a free name");
         fs::rename(&path, &to).map_err(RunError::io("rename", &path))?;
         // A folder that is not empty stays.
         let _ = path.parent().map(fs::remove_dir);
@@ -196,10 +204,18 @@ mod tests {
             there("unused/images/b.png") && there("unused/masks/a.png.png"),
             "nothing is lost"
         );
+        write(source.join("b.png"), 9);
+        bring(true);
+        fs::remove_file(source.join("b.png")).unwrap();
+        bring(false);
+        assert!(
+            there("unused/images/b.png") && there("unused/images/b.2.png"),
+            "nor replaced by what is put away later"
+        );
         fs::write(out.join(RECORD), r#"["../source/a.png", "images/none.png"]"#).unwrap();
         bring(false);
         assert!(source.join("a.png").exists());
-        // A dataset in place: its own files are not recorded.
+        // A dataset that is posed in place: its own files are not recorded.
         let photos = read_photo_folder(&out).unwrap().photos;
         fs::remove_file(out.join(RECORD)).unwrap();
         record(&out, &photos.iter().collect::<Vec<_>>(), false).unwrap();

@@ -1,4 +1,4 @@
-//! What is posed: photographs of one or several folders, frames of films, faces of panoramas.
+//! The photographs to pose: those of one or several folders, frames of films, faces of panoramas.
 
 use super::brought::bring_panorama;
 use super::{MIN_PHOTOS, PoseProgress, film, is_film};
@@ -15,30 +15,30 @@ use std::collections::{HashMap, HashSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Where frames of films and faces of panoramas are written, in the folder of the dataset.
+/// Subfolders of the dataset's folder for frames of films and faces of panoramas.
 const FRAMES: &str = "frames";
 const FACES: &str = "faces";
-/// What tells that the folder of faces is of an earlier call.
+/// File that marks the folder of faces as written by an earlier call.
 const FACES_RECORD: &str = "faces.json";
-/// Folders within folders that are searched.
+/// Depth of subfolders that are searched.
 const DEPTH: usize = 2;
 
 /// Folders of photographs, and films.
 #[derive(Debug, Default, PartialEq)]
 struct Sources {
     folders: Vec<PathBuf>,
-    /// Films that were named.
+    /// Films that the user named.
     films: Vec<PathBuf>,
-    /// Films in the folders.
+    /// Films found in folders, except `live` ones.
     beside: Vec<PathBuf>,
-    /// Those of them that a phone takes with a photograph of the same name.
+    /// Films that a phone took along with a photograph of the same name.
     live: Vec<PathBuf>,
-    /// Folders with photographs in folders of photographs.
+    /// Subfolders with photographs in folders of photographs.
     below: Vec<PathBuf>,
 }
 
 impl Sources {
-    /// What `path` holds: a film; a folder of photographs and films; else what the folders in it hold.
+    /// Adds `path`, which is a film or a folder of photographs and films, or otherwise the subfolders of `path`.
     fn add(&mut self, path: &Path, depth: usize) -> Result<(), RunError> {
         if is_film(path) {
             self.films.push(path.to_owned());
@@ -71,14 +71,14 @@ impl Sources {
         entries.retain(|entry| entry.is_dir() && !is_beside(entry));
         if !photos.is_empty() {
             self.folders.push(path.to_owned());
-            // They may hold smaller copies, or what was sorted out; datasets have folders of their own.
+            // Subfolders may contain smaller copies, or rejected photographs; datasets have subfolders of their own.
             if photos[0].parent() == Some(path) {
                 let is_capture =
                     |entry: &PathBuf| DatasetFormat::recognise(entry).is_none() && !photo_files(entry).is_empty();
                 self.below.extend(entries.into_iter().filter(is_capture));
             }
         } else if depth > 0 {
-            // A folder of datasets is no capture.
+            // A folder of datasets is not a capture.
             if !entries.iter().any(|entry| DatasetFormat::recognise(entry).is_some()) {
                 for folder in &entries {
                     self.add(folder, depth - 1)?;
@@ -89,23 +89,23 @@ impl Sources {
     }
 }
 
-/// Whether there is anything to pose at `path`: photographs or films, itself, in its folders, or in theirs.
+/// Whether there is anything to pose at `path`: `path` is a film, or contains photographs or films, up to two levels of subfolders deep.
 pub fn is_capture(path: &Path) -> bool {
     let mut sources = Sources::default();
     sources.add(path, DEPTH).is_ok() && sources != Sources::default()
 }
 
-/// Empties a folder that an earlier call wrote, which its record tells, or creates it, with an empty record.
+/// Creates a folder with an empty record, or empties it if its record shows that an earlier call wrote it.
 ///
 /// # Errors
-/// When it holds anything of another origin, or cannot be written.
+/// When the folder contains files without a record, or cannot be written.
 pub(super) fn begin(folder: &Path, record: &str) -> Result<(), RunError> {
     let record = folder.join(record);
     if folder.exists() {
         let is_empty = fs::read_dir(folder).is_ok_and(|mut entries| entries.next().is_none());
         if !is_empty && !record.exists() {
             return Err(RunError::Refused(format!(
-                "{} holds files of another origin: choose another --out",
+                "{} contains files from another source: choose another --out",
                 folder.display()
             )));
         }
@@ -116,22 +116,22 @@ pub(super) fn begin(folder: &Path, record: &str) -> Result<(), RunError> {
     Ok(())
 }
 
-/// Photographs that are to be posed.
+/// The photographs to pose.
 #[derive(Debug)]
 pub(super) struct Capture {
-    /// The photographs, also those that stand for frames and panoramas.
+    /// The photographs, including frames of films and faces of panoramas.
     pub folder: PhotoFolder,
     /// Whether some are frames of films.
     pub has_films: bool,
-    /// Faces of panoramas by their names, and the number of the panorama.
+    /// Faces of panoramas by name, each with the number of its panorama.
     faces: HashMap<String, (usize, PanoramaFace)>,
 }
 
 impl Capture {
-    /// Reads what `paths` hold. Frames and faces are written into folders of `out`.
+    /// Reads the photographs, films and panoramas in `paths`. Frames and faces are written into subfolders of `out`.
     ///
     /// # Errors
-    /// When a path or a film cannot be read, or frames and faces have nowhere to be written or cannot be.
+    /// When a path or a film cannot be read, or frames or faces cannot be written, for instance without `out`.
     pub fn read(
         paths: &[PathBuf],
         out: Option<&Path>,
@@ -151,13 +151,13 @@ impl Capture {
             sources.below,
             "a folder beside photographs: name it as well if its photographs are of the same scene",
         );
-        unused(sources.live, "a film that was taken with the photograph of its name");
+        unused(sources.live, "a film taken with the photograph of the same name");
         let named = sources.films.len();
         match sources.beside.is_empty() || sources.folders.is_empty() || film::can_be_read() {
             true => sources.films.append(&mut sources.beside),
             false => unused(
                 sources.beside,
-                "a film, which needs ffmpeg: install it to use its frames",
+                "a film, which cannot be read without ffmpeg: install ffmpeg to use its frames",
             ),
         }
         let needs_out = |what: &str| {
@@ -219,7 +219,7 @@ impl Capture {
         let mut names = HashSet::new();
         if let Some(name) = all().find(|name| taken(name) || !names.insert(*name)) {
             return Err(RunError::Refused(format!(
-                "a face of a panorama is named {name}, as another photograph: rename the panorama"
+                "a face of a panorama is named {name}, like another photograph: rename the panorama"
             )));
         }
         let of: HashMap<String, (usize, PanoramaFace)> = (cut.into_iter().enumerate())
@@ -231,7 +231,7 @@ impl Capture {
         for mut photo in written.photos {
             let (rig, face) = &of[&photo.name];
             let tags = &panoramas[*rig].tags;
-            // A panorama tells its place once.
+            // Only one face has the panorama's GPS position, so that it counts once.
             photo.tags.gps = tags.gps.filter(|_| face.turn == DQuat::IDENTITY);
             photo.tags.time.clone_from(&tags.time);
             photo.tags.focal = Some(f64::from(face.camera.fx) / f64::from(photo.width.max(photo.height)));
@@ -242,10 +242,10 @@ impl Capture {
         Ok(())
     }
 
-    /// What the mapper is told of the photographs `used`, indices of the folder's.
+    /// The mapper's input for the photographs `used`, indices of the folder's photographs.
     pub fn infos(&self, used: &[usize]) -> Vec<PhotoInfo> {
         let groups = self.folder.groups();
-        // Groups are numbered from 0 without gaps, also where photographs could not be decoded.
+        // Groups are numbered from 0 without gaps, even if some photographs could not be decoded.
         let mut numbers: Vec<usize> = Vec::new();
         let info = |i: &usize| {
             let photo = &self.folder.photos[*i];
@@ -291,7 +291,7 @@ mod tests {
         fs::remove_file(folder.join("record.json")).unwrap();
         fs::write(folder.join("mine.jpg"), "somebody's").unwrap();
         let error = begin(&folder, "record.json").unwrap_err().to_string();
-        assert!(error.contains("another origin"), "{error}");
+        assert!(error.contains("another source"), "{error}");
         assert!(folder.join("mine.jpg").exists());
     }
 
@@ -314,7 +314,7 @@ mod tests {
             assert_eq!(live.len() + beside.len(), 2);
         };
         write(&["IMG_1.MOV", "walk.mp4", "walk.jpg"]);
-        // A picture of a film is no capture beside it.
+        // A single photograph with the name of a film does not make the film a phone's.
         live(&[]);
         write(&["IMG_1.HEIC", "IMG_2.JPG"]);
         live(&["IMG_1.MOV", "walk.mp4"]);
@@ -343,7 +343,7 @@ mod tests {
         assert_eq!(sources.beside, [days.join("walk.mp4")]);
         assert!(sources.films.is_empty() && sources.live.is_empty());
         assert!(is_capture(&days) && is_capture(&days.join("walk.mp4")));
-        // One of several folders has poses: whatever the others are, they are not one capture with it.
+        // One of several folders has poses: the others do not form one capture with it.
         photo("sets/posed/images/1.png");
         fs::write(root.path().join("sets/posed/transforms.json"), "{}").unwrap();
         photo("sets/other/1.png");

@@ -1,8 +1,8 @@
-//! Whether the poses of a dataset agree with its photographs.
+//! Checks whether the poses of a dataset agree with its photographs.
 //!
-//! Programs that find poses may take one part of a scene for another that looks alike, and the dataset then jumps between adjacent photographs. Their
-//! own reprojection errors do not show it, since they dropped the matches that contradict them; matching the photographs again does. Where nothing else matches,
-//! nothing contradicts: there the points tell, which photographs from nearly the same place do not share.
+//! Programs that find poses may confuse parts of a scene that look alike, and the poses then jump between adjacent photographs. Their
+//! own reprojection errors do not show it, since they dropped the contradicting matches; matching the photographs again does. If no other
+//! matches exist, nothing contradicts the poses: then the evidence is that photographs from nearly the same place share no points.
 
 use super::look::{Look, pose};
 use irradia_scene::{Dataset, View};
@@ -16,46 +16,47 @@ use irradia_sfm::matching::{MatchOptions, PairOptions, candidate_pairs, match_pa
 use rayon::prelude::*;
 use std::collections::BTreeSet;
 
-/// Long side of the photographs that are compared, px, and the most features of each: neighbours are told by a fraction of what poses need.
+/// Longer side of the compared photographs, px, and maximum number of features of each: recognising neighbours takes a fraction of what
+/// poses need.
 const SIDE: u32 = 480;
 const FEATURES: usize = 1000;
-/// Photographs that are compared; of more, evenly spaced ones.
+/// Maximum number of photographs that are compared; if there are more, evenly spaced ones.
 const PHOTOGRAPHS: usize = 120;
 
-/// Pairs across which the poses must jump, to be told from parts of a scene that do look alike.
+/// Minimum number of pairs at which the poses must jump: a single one may be of parts of the scene that really look alike.
 const JUMPS: usize = 2;
-/// Neighbours that must agree with a photograph for it to be in place.
+/// Minimum number of neighbours that must agree with a photograph's pose for it to count as in place.
 const SEVERAL: usize = 2;
-/// The share of pairs that contradict their poses from which on it is not single photographs that are wrong.
+/// Minimum share of contradicting pairs for the error to be more than single wrong photographs.
 const SHARE: f64 = 0.1;
 
-/// What the matches of photographs say of their poses.
+/// How well matches between photographs agree with their poses.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PoseCheck {
-    /// Pairs of adjacent photographs with enough matches to tell.
+    /// Number of pairs of adjacent photographs with enough matches to count as evidence.
     pub pairs: usize,
-    /// Names of those whose matches contradict their poses, those with most matches first.
+    /// Names of the pairs whose matches contradict their poses, those with the most matches first.
     pub contradicting: Vec<[String; 2]>,
-    /// Those of them whose photographs agree with others: there the poses jump.
+    /// Contradicting pairs whose photographs both agree with others: the poses jump there.
     pub jumps: Vec<[String; 2]>,
-    /// Names of those that by their poses see the same and share nothing, neither points of the dataset nor matches, those that should share most
-    /// first; none where they are so few that it may be chance.
+    /// Names of pairs whose poses say that they see the same part of the scene, but that share neither points of the dataset nor matches;
+    /// those that should share most first. Empty if they are so few that it may be coincidence.
     pub absent: Vec<[String; 2]>,
 }
 
 impl PoseCheck {
-    /// Whether more is wrong than the poses of single photographs.
+    /// Whether the poses are wrong in more than single photographs.
     pub fn is_broken(&self) -> bool {
         self.jumps.len() >= JUMPS || (self.contradicting.len() >= JUMPS && self.share() >= SHARE)
     }
 
-    /// The share of pairs that contradict their poses.
+    /// The share of pairs whose matches contradict their poses.
     pub fn share(&self) -> f64 {
         self.contradicting.len() as f64 / self.pairs.max(1) as f64
     }
 }
 
-/// Matches the photographs of `dataset` and compares what they say with its poses. Photographs that cannot be read are left out.
+/// Matches the photographs of `dataset` and compares the matches with its poses. Photographs that cannot be read are skipped.
 pub fn check_poses(dataset: &Dataset) -> PoseCheck {
     let step = dataset.views.len().div_ceil(PHOTOGRAPHS).max(1);
     let look = |view| Some((view, Look::at(view, SIDE, FEATURES)?));
@@ -76,7 +77,7 @@ pub fn check_poses(dataset: &Dataset) -> PoseCheck {
     let (_, mut pairs) = verify(&photos, &features, &matches, &MapOptions::default(), &mut |_| ());
     let related: BTreeSet<[u32; 2]> = pairs.iter().map(|pair| pair.photos).collect();
     let absent: Vec<[u32; 2]> = absent.into_iter().filter(|pair| !related.contains(pair)).collect();
-    // What only turns or stands still, such as the background of a turntable, tells little of the places.
+    // Pure rotations, and what stands still, such as the background of a turntable, say little about the positions.
     pairs.retain(|pair| pair.kind != PairKind::Rotation);
     let strengths = strengths(&photos, &features, &pairs);
     let model = Model {
@@ -103,14 +104,14 @@ pub fn check_poses(dataset: &Dataset) -> PoseCheck {
     }
 }
 
-/// Pairs of `views` that by their poses see the same and share no points of the dataset.
+/// Pairs of `views` whose poses say that they see the same part of the scene, but that share no points of the dataset.
 fn absent_pairs(dataset: &Dataset, views: &[&View], photos: &[PhotoInfo]) -> Vec<[u32; 2]> {
     let Some(points) = &dataset.points else {
         return Vec::new();
     };
     let mut tracks = vec![Vec::new(); points.len()];
     for (photo, view) in (0u32..).zip(views) {
-        // Which feature it was is not known, and does not matter.
+        // The index of the feature is unknown and does not matter.
         view.points_seen
             .iter()
             .for_each(|i| tracks[*i as usize].push((photo, 0)));
@@ -138,8 +139,8 @@ fn absent_pairs(dataset: &Dataset, views: &[&View], photos: &[PhotoInfo]) -> Vec
     absent(photos, &model).iter().map(|pair| pair.photos).collect()
 }
 
-/// `[photos]` whether several neighbours of a photograph agree with its pose: one that is wrong on its own contradicts all of them, while a jump leaves
-/// each side in agreement with itself.
+/// `[photos]` whether several neighbours of a photograph agree with its pose: a single wrong photograph contradicts all its neighbours,
+/// whereas at a jump the photographs on each side agree with one another.
 fn in_place(photos: usize, pairs: &[VerifiedPair], strengths: &[f64], agreement: &[Option<f64>]) -> Vec<bool> {
     let mut agreeing = vec![0; photos];
     let agree = telling(pairs, strengths).filter(|i| agreement[*i].is_some_and(|agreement| agreement > 0.5));
@@ -149,7 +150,7 @@ fn in_place(photos: usize, pairs: &[VerifiedPair], strengths: &[f64], agreement:
     agreeing.into_iter().map(|agreeing| agreeing >= SEVERAL).collect()
 }
 
-/// The poses in a world in which the cameras' median distance from their middle is 1.
+/// The poses, moved and scaled such that the cameras' mean position is the origin and their median distance from it is 1.
 fn poses(views: &[&View]) -> Vec<Option<DPose>> {
     let mut poses: Vec<DPose> = views.iter().map(|view| pose(&view.camera)).collect();
     let middle = poses.iter().map(|pose| pose.position).sum::<glam::DVec3>() / poses.len().max(1) as f64;

@@ -1,4 +1,4 @@
-//! Poses by COLMAP, where it is asked for: whichever version is on the path, whose options are taken from its own help.
+//! Poses by COLMAP, if requested: works with any installed version, whose options are taken from its own help.
 
 use super::brought;
 use super::capture::Capture;
@@ -10,10 +10,10 @@ use std::fs;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-/// Photographs up to which COLMAP matches all pairs; beyond, those that follow one another.
+/// Maximum number of photographs of which COLMAP matches all pairs; with more, it matches successive ones.
 const EXHAUSTIVE: usize = 300;
 
-/// Runs COLMAP's features, matching and mapper on the photographs of `folder`, and leaves its models in `sparse` of the dataset.
+/// Runs COLMAP's feature extraction, matching and mapper on the photographs of `capture`, and puts its models into `sparse` of the dataset.
 pub(super) fn run(
     input: &PoseInput,
     capture: &Capture,
@@ -26,11 +26,11 @@ pub(super) fn run(
     for photo in &folder.photos {
         brought::bring_photo(out, photo)?;
     }
-    // COLMAP reads whatever lies there.
+    // Also puts away files of other photographs: COLMAP reads everything in the folder.
     brought::record(out, &folder.photos.iter().collect::<Vec<_>>(), false)?;
     let (database, written) = (out.join("colmap.db"), output::begin_models(out)?);
     if database.exists() {
-        // COLMAP would add to that of an earlier call.
+        // COLMAP would add to the database of an earlier call.
         fs::remove_file(&database).map_err(RunError::io("clear", &database))?;
     }
     let stage = |name| progress(PoseProgress::Stage { name, of: 0 });
@@ -71,7 +71,7 @@ pub(super) fn run(
     mapper.path("database_path", &database).path("image_path", &images);
     let mapped = mapper.path("output_path", &written).run();
     if !written.join("0").is_dir() {
-        // Some versions fail then, others do not.
+        // Some versions report this as a failure, others do not.
         let why = mapped.err().map_or(String::new(), |error| format!(" ({error})"));
         return Err(RunError::Refused(format!(
             "{}: COLMAP found no model{why}; try without --poses colmap, or see irradia doctor",
@@ -83,7 +83,7 @@ pub(super) fn run(
     report(out, folder)
 }
 
-/// What became of the photographs, as far as COLMAP's files tell.
+/// The report, as far as COLMAP's files provide it.
 fn report(out: &Path, folder: &PhotoFolder) -> Result<PoseReport, RunError> {
     let (_, _, images) = read_colmap_poses(out)?;
     let mut points: Vec<u64> = images.iter().flat_map(|image| image.points.iter().copied()).collect();
@@ -112,7 +112,7 @@ fn report(out: &Path, folder: &PhotoFolder) -> Result<PoseReport, RunError> {
     })
 }
 
-/// A COLMAP that answers.
+/// An installed COLMAP that runs.
 struct Colmap {
     program: String,
     /// Whether it was built with CUDA.
@@ -124,7 +124,7 @@ impl Colmap {
         let answer = Command::new(program).arg("help").stdin(Stdio::null()).output();
         let answer = answer.map_err(|error| {
             RunError::Refused(format!(
-                "{program} cannot be run ({error}): install COLMAP, or leave --poses colmap out"
+                "{program} cannot be run ({error}): install COLMAP, or leave out --poses colmap"
             ))
         })?;
         Ok(Self {
@@ -133,12 +133,12 @@ impl Colmap {
         })
     }
 
-    /// Without CUDA, its GPU path needs a display.
+    /// Whether COLMAP uses the GPU: only with CUDA, since its other GPU path needs a display.
     fn use_gpu(&self) -> &'static str {
         if self.has_cuda { "1" } else { "0" }
     }
 
-    /// One of its commands, with the options that its help names.
+    /// One of COLMAP's commands, with the options that its help lists.
     fn command(&self, name: &'static str) -> Result<Step, RunError> {
         let help = Command::new(&self.program)
             .args([name, "-h"])
@@ -148,7 +148,7 @@ impl Colmap {
             help.map_err(|error| RunError::Refused(format!("{} {name} cannot be run: {error}", self.program)))?;
         let mut command = Command::new(&self.program);
         command.arg(name).stdin(Stdio::null());
-        // No version opens a window for these, but Qt asks for one.
+        // No version opens a window for these commands, but Qt requires a display otherwise.
         command.env("QT_QPA_PLATFORM", "offscreen");
         Ok(Step {
             name,
@@ -162,10 +162,10 @@ impl Colmap {
     }
 }
 
-/// A command of COLMAP's with its options.
+/// One of COLMAP's commands with its options.
 struct Step {
     name: &'static str,
-    /// Its help.
+    /// The command's help text.
     known: String,
     command: Command,
 }
@@ -176,7 +176,7 @@ impl Step {
         self
     }
 
-    /// Sets the first of `names`, which versions differ in, that this version knows; none if it knows none.
+    /// Sets an option whose name differs between versions: the first of `names` that this version knows, if any.
     fn option(&mut self, names: &[&str], value: &str) {
         let is_known = |name: &&&str| {
             self.known
@@ -202,7 +202,7 @@ impl Step {
             .lines()
             .rev()
             .find(|line| !line.trim().is_empty())
-            .unwrap_or("it said nothing");
+            .unwrap_or("no error message");
         Err(RunError::Refused(format!(
             "colmap {name} failed ({}): {}",
             output.status,

@@ -1,4 +1,4 @@
-//! The capture doctor on files: `doctor.json`, and `doctor.html` with small pictures and a plan.
+//! The capture doctor on files: `doctor.json`, and `doctor.html` with thumbnails and a plan.
 
 use super::capture::Capture;
 use super::stages::{Work, in_rgb};
@@ -16,32 +16,32 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-/// The report, its page, and the folder of its pictures.
+/// The report, its page, and the folder of its thumbnails.
 const REPORT: &str = "doctor.json";
 const PAGE: &str = "doctor.html";
 const PICTURES: &str = "doctor";
 /// The page, with a place for the report.
 const TEMPLATE: &str = include_str!("doctor.html");
-/// Long side of the small pictures, px.
+/// Longer side of the thumbnails, px.
 const SMALL: u32 = 240;
-/// Findings with pictures, at most.
+/// Maximum number of findings with thumbnails.
 const PICTURED: usize = 60;
-/// Points in the plan, at most.
+/// Maximum number of points in the plan.
 const PLAN_POINTS: usize = 2000;
 
 /// A request for a diagnosis.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DoctorInput {
-    /// Folders of photographs and films, and films; these need `out`.
+    /// Folders of photographs and films, and films. Films need `out`.
     pub photos: Vec<PathBuf>,
-    /// Where the report, features and matches are written, if anywhere.
+    /// The folder for the report, features and matches; if `None`, nothing is written.
     pub out: Option<PathBuf>,
-    /// The most features of a photograph, at least 1; by the number of photographs if `None`.
+    /// Maximum number of features per photograph, at least 1; depends on the number of photographs if `None`.
     pub max_features: Option<usize>,
 }
 
 impl DoctorInput {
-    /// With the usual options; nothing is written.
+    /// A request with the default options; nothing is written.
     pub fn new(photos: impl Into<PathBuf>) -> Self {
         Self {
             photos: vec![photos.into()],
@@ -54,17 +54,17 @@ impl DoctorInput {
 /// What is wrong with a capture; `doctor.json`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct DoctorReport {
-    /// Pictures found.
+    /// Number of photographs found.
     pub photos: usize,
-    /// The gravest first.
+    /// The findings, the most serious first.
     pub findings: Vec<Finding>,
     /// Cameras and points seen from above, if there is a model.
     pub plan: Option<Plan>,
-    /// Seconds in all, of [`doctor`] alone.
+    /// Total seconds; set only by [`doctor`].
     pub seconds: f64,
 }
 
-/// One fault.
+/// One fault of a capture.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Finding {
     /// Its kind, such as `blurred`.
@@ -73,18 +73,18 @@ pub struct Finding {
     pub sentence: String,
     /// Names of the photographs at fault.
     pub photos: Vec<String>,
-    /// Photographs of both sides, of which the page shows small pictures.
+    /// Photographs on both sides of the fault, of which the page shows thumbnails.
     pub sides: Vec<String>,
-    /// Where photographs would mend it.
+    /// Where further photographs would fix it.
     pub shoot: Vec<Place>,
     #[serde(skip)]
     pictured: Vec<usize>,
 }
 
-/// A camera or a place for one, in the coordinates of the model.
+/// A camera, or a place from which to take a photograph, in the coordinates of the model.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Place {
-    /// The photograph's name; empty for one that is to be taken.
+    /// The photograph's name; empty for one to be taken.
     pub name: String,
     /// Position; up is +Z, the cameras' median distance from the origin is 1.
     pub position: [f64; 3],
@@ -101,7 +101,7 @@ pub struct Plan {
     pub points: Vec<[f32; 2]>,
 }
 
-/// Examines photographs by their pixels, features and pairs, without mapping them.
+/// Examines the pixels, features and pairs of photographs, without mapping them.
 ///
 /// # Errors
 /// When there are fewer than three photographs, or a file cannot be read or written.
@@ -135,7 +135,7 @@ pub fn doctor(input: &DoctorInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> 
     Ok(report)
 }
 
-/// Diagnoses what is known after verification, or after mapping if there is a model; `masked` stood still before it was masked.
+/// Diagnoses a capture after verification, or after mapping if there is a model; `masked` is what stood still before it was masked.
 pub(super) fn examine(
     work: &Work,
     infos: &[PhotoInfo],
@@ -194,7 +194,7 @@ fn finding(diagnosis: &Diagnosis, names: &[String], model: Option<&Model>) -> Fi
     }
 }
 
-/// Pictures that cannot be read have no other faults; those with the same reason are one finding.
+/// Adds findings about photographs that are left out before any examination; those with the same reason are one finding.
 pub(super) fn add_unreadable(report: &mut DoctorReport, folder: &PhotoFolder, work: &Work) {
     report.photos += folder.left_out.len();
     let unused = folder.unused().chain(work.undecodable());
@@ -243,11 +243,11 @@ fn plan(model: &Model, infos: &[PhotoInfo]) -> Plan {
     }
 }
 
-/// Writes the report, its page and its pictures.
+/// Writes the report, its page and its thumbnails.
 pub(super) fn write(out: &Path, folder: &PhotoFolder, work: &Work, report: &DoctorReport) -> Result<(), RunError> {
     let pictures = out.join(PICTURES);
     if pictures.exists() && out.join("doctor.json").exists() {
-        // Those of an earlier call.
+        // The thumbnails of an earlier call.
         fs::remove_dir_all(&pictures).map_err(RunError::io("clear", &pictures))?;
     }
     let shown: BTreeMap<&str, usize> = report
@@ -270,7 +270,7 @@ pub(super) fn write(out: &Path, folder: &PhotoFolder, work: &Work, report: &Doct
         write_png(&picture, size[0], size[1], 3, &rgb)?;
     }
     let json = to_json(report);
-    // Within a script element only `<` can end the data; strings of JSON may escape any character.
+    // Within a script element only `<` can end the data; JSON strings may escape any character.
     let data = String::from_utf8_lossy(&json).replace('<', "\\u003c");
     let page = TEMPLATE.replace("/*DATA*/", &data);
     write_atomic(&out.join(REPORT), |file| file.write_all(&json))?;
@@ -278,7 +278,7 @@ pub(super) fn write(out: &Path, folder: &PhotoFolder, work: &Work, report: &Doct
     Ok(())
 }
 
-/// A photograph, reduced by a whole number to about [`SMALL`]: its size and RGB.
+/// A photograph, reduced by an integer factor to about [`SMALL`]: its size and RGB.
 fn small(photo: &irradia_formats::PhotoEntry) -> Result<([u32; 2], Vec<u8>), RunError> {
     let pixels = photo.read(SMALL)?;
     let size = [pixels.width, pixels.height];

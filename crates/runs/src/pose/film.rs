@@ -1,4 +1,4 @@
-//! The frames of films that are worth posing: the sharpest of each window, windows being equal in motion.
+//! Selection of frames from films for posing: the sharpest frame of each window, where windows contain equal amounts of motion.
 
 use super::PoseProgress;
 use super::capture::begin;
@@ -15,21 +15,21 @@ use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-/// Extensions of films.
+/// File extensions of films.
 const FILMS: [&str; 8] = ["mp4", "mov", "m4v", "mkv", "webm", "avi", "mpg", "mpeg"];
-/// Frames chosen of all films, unless they have fewer.
+/// Minimum and maximum number of frames chosen from all films together, unless they have fewer.
 const FRAMES: [usize; 2] = [100, 300];
-/// Motion between chosen frames, in widths of the picture: two thirds of a picture and more stay in view for several frames.
+/// Motion between chosen frames, in frame widths: two thirds of a frame or more stay in view for several frames.
 const SPACING: f64 = 0.05;
-/// Motion of a frame whose features match none of those before.
+/// Motion assigned to a frame with too few matches with the frame before, in frame widths.
 const LOST: f64 = 0.1;
-/// Frames of each film, if it has so many.
+/// Minimum number of frames from each film, if it has that many.
 const LEAST: usize = 10;
-/// Pixels across the frames in which motion and sharpness are measured.
+/// Width of the frames in which motion and sharpness are measured, pixels.
 const WIDTH: u32 = 320;
-/// Frames that are measured in parallel.
+/// Number of frames that are measured in parallel.
 const BATCH: usize = 32;
-/// The longest line of a header of ffmpeg's grey pictures.
+/// Maximum length of a line in the header of ffmpeg's grey images, bytes.
 const LONGEST_LINE: usize = 64;
 
 /// Whether `path` has the extension of a film.
@@ -48,7 +48,7 @@ pub(super) fn can_be_read() -> bool {
     ffmpeg_version().is_some()
 }
 
-/// What ffmpeg says of its version, if it is installed.
+/// The version text of ffmpeg, if it is installed.
 fn ffmpeg_version() -> Option<String> {
     let output = Command::new("ffmpeg")
         .arg("-version")
@@ -59,31 +59,31 @@ fn ffmpeg_version() -> Option<String> {
     output.status.success().then_some(said)
 }
 
-/// The option by which ffmpeg of this `version` passes every frame once: `-fps_mode` is new in 5.1, and `-vsync` is gone in later ones.
+/// The option that makes ffmpeg of this `version` pass every frame once: `-fps_mode` is new in 5.1, and later versions removed `-vsync`.
 fn frame_option(version: &str) -> &'static str {
     let number = version.strip_prefix("ffmpeg version ").unwrap_or_default();
     let mut parts = number.trim_start_matches('n').split(['.', '-', ' ']);
     let mut part = || parts.next()?.parse::<u32>().ok();
     match part() {
-        // Of a build between versions nothing is known.
+        // Development builds do not have a version number.
         Some(major) if (major, part().unwrap_or(0)) < (5, 1) => "-vsync",
         _ => "-fps_mode",
     }
 }
 
-/// The record of what was chosen, beside the frames; it begins empty.
+/// The record of the chosen frames, beside them; it is empty at first.
 const RECORD: &str = "frames.json";
 
-/// Which frames of a film were chosen, to reuse them.
+/// The frames chosen from a film, recorded so that a later call can reuse them.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 struct Chosen {
     film: PathBuf,
     bytes: u64,
     modified: Option<std::time::SystemTime>,
-    /// What the frames' names begin with.
+    /// Prefix of the frames' names.
     stem: String,
     frames: Vec<usize>,
-    /// Why it gives no frames.
+    /// Why the film provides no frames.
     #[serde(default)]
     damaged: Option<String>,
 }
@@ -93,14 +93,15 @@ impl Chosen {
         format!("{}_{frame:06}.jpg", self.stem)
     }
 
-    /// Its file's name and the reason, if it gives no frames.
+    /// The film's file name and the reason, if it provides no frames.
     fn left_out(&self) -> Option<(String, String)> {
         let name = self.film.file_name().unwrap_or_default().to_string_lossy().into_owned();
         self.damaged.clone().map(|reason| (name, reason))
     }
 }
 
-/// Writes the chosen frames of `films` as JPEG into `folder`, unless an earlier call did. Returns those of all but the first `named` films that cannot be read, and why.
+/// Writes the chosen frames of `films` as JPEG into `folder`, unless an earlier call already did. Returns the films that cannot be read,
+/// and why; if one of the first `named` films cannot be read, that is an error.
 pub(super) fn frames(
     films: &[PathBuf],
     named: usize,
@@ -110,7 +111,7 @@ pub(super) fn frames(
     let record = folder.join(RECORD);
     let mut chosen = films.iter().map(|film| of_file(film)).collect::<Result<Vec<_>, _>>()?;
     for i in 0..chosen.len() {
-        // Films of several folders may have one name.
+        // Films in different folders may have the same name.
         if chosen[..i].iter().any(|other| other.stem == chosen[i].stem) {
             chosen[i].stem = format!("{}_{}", chosen[i].stem, i + 1);
         }
@@ -136,7 +137,7 @@ pub(super) fn frames(
     for (i, film) in films.iter().enumerate() {
         let frames = match measure(film, before, progress) {
             Ok(frames) => frames,
-            // Once ffmpeg is installed they can be read.
+            // Without ffmpeg, a film is not damaged: it can be read once ffmpeg is installed.
             Err(error) if i < named || !can_be_read() => return Err(error),
             Err(error) => {
                 let said = error.to_string();
@@ -148,7 +149,7 @@ pub(super) fn frames(
         before += frames.len();
         measured.push(frames);
     }
-    // Frames of an earlier choice must not be taken for photographs.
+    // Frames of an earlier selection must not be used as photographs.
     begin(folder, RECORD)?;
     for ((chosen, frames), wanted) in chosen.iter_mut().zip(&measured).zip(shares(&measured)) {
         if !frames.is_empty() {
@@ -160,7 +161,7 @@ pub(super) fn frames(
     Ok(chosen.iter().filter_map(Chosen::left_out).collect())
 }
 
-/// A film of which nothing is chosen yet.
+/// A film without chosen frames.
 fn of_file(film: &Path) -> Result<Chosen, RunError> {
     let metadata = fs::metadata(film).map_err(RunError::io("read", film))?;
     Ok(Chosen {
@@ -173,7 +174,8 @@ fn of_file(film: &Path) -> Result<Chosen, RunError> {
     })
 }
 
-/// How many frames of each film are chosen: of all films as many as their motion asks for, in proportion to each film's.
+/// Number of frames to choose from each film: the total depends on the motion of all films and is distributed in proportion to the motion
+/// of each.
 fn shares(films: &[Vec<Frame>]) -> Vec<usize> {
     let motion = |frames: &Vec<Frame>| frames.iter().map(|frame| frame.motion).sum::<f64>();
     let total: f64 = films.iter().map(motion).sum();
@@ -187,16 +189,16 @@ fn shares(films: &[Vec<Frame>]) -> Vec<usize> {
     films.iter().map(count).collect()
 }
 
-/// What is measured of a frame.
+/// Measurements of a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Frame {
-    /// Motion since the frame before, in widths of the picture.
+    /// Motion since the frame before, in frame widths.
     motion: f64,
     /// Mean square of the Laplacian.
     sharpness: f64,
 }
 
-/// Measures all frames of a film, at a reduced size; `before` frames of other films were measured before it.
+/// Measures all frames of a film, at a reduced size; `before` frames of other films have already been measured.
 fn measure(film: &Path, before: usize, progress: &(dyn Fn(PoseProgress) + Sync)) -> Result<Vec<Frame>, RunError> {
     let mut child = Command::new("ffmpeg")
         .args(["-loglevel", "error", "-i"])
@@ -210,7 +212,7 @@ fn measure(film: &Path, before: usize, progress: &(dyn Fn(PoseProgress) + Sync))
         .spawn()
         .map_err(|error| no_ffmpeg(film, &error))?;
     let mut pictures = BufReader::with_capacity(1 << 20, child.stdout.take().expect("a pipe"));
-    // Whatever ffmpeg says is read meanwhile, or it would wait.
+    // Errors are read concurrently: a full pipe would block ffmpeg.
     let mut errors = child.stderr.take().expect("a pipe");
     let said = std::thread::spawn(move || {
         let mut said = String::new();
@@ -248,6 +250,8 @@ fn measure(film: &Path, before: usize, progress: &(dyn Fn(PoseProgress) + Sync))
         last = seen.into_iter().next_back().map(|(features, _)| features);
         progress(PoseProgress::Done(before + frames.len()));
     }
+    // Where a frame could not be read, ffmpeg would wait forever for a reader.
+    drop(pictures);
     let status = child.wait().map_err(RunError::io("read", film))?;
     let said = said.join().unwrap_or_default();
     if !status.success() {
@@ -259,7 +263,7 @@ fn measure(film: &Path, before: usize, progress: &(dyn Fn(PoseProgress) + Sync))
     Ok(frames)
 }
 
-/// A film as ffmpeg takes it, whose name may look like another protocol's.
+/// The URL of a film for ffmpeg; a plain file name might look like another protocol.
 fn file_url(film: &Path) -> OsString {
     let mut url = OsString::from("file:");
     url.push(std::path::absolute(film).unwrap_or_else(|_| film.to_owned()));
@@ -278,7 +282,7 @@ fn unreadable(film: &Path, said: &str) -> RunError {
     RunError::Refused(format!("{}: ffmpeg cannot read the film: {last}", film.display()))
 }
 
-/// A grey picture.
+/// A grey image.
 struct Picture {
     width: u32,
     height: u32,
@@ -309,7 +313,7 @@ impl Picture {
     }
 }
 
-/// The next picture of a stream of binary PGM; `None` at its end, or where it is not one of ffmpeg's.
+/// The next image of a stream of binary PGM; `None` at the end of the stream, or if the data are not an image by ffmpeg.
 fn read_picture(stream: &mut impl Read) -> Option<Picture> {
     if read_line(stream)? != "P5" {
         return None;
@@ -338,7 +342,7 @@ fn read_line(stream: &mut impl Read) -> Option<String> {
     }
 }
 
-/// The median distance between matching features, in widths of the picture.
+/// The median distance between matching features, in frame widths.
 fn motion(before: &Features, after: &Features) -> f64 {
     let mut distances: Vec<f32> = match_features(before, after, &MatchOptions::default())
         .into_iter()
@@ -364,7 +368,7 @@ fn choose(frames: &[Frame], wanted: usize) -> Vec<usize> {
     let mut moved = 0.0;
     for (i, frame) in frames.iter().enumerate() {
         moved += frame.motion;
-        // A camera that stands still has windows equal in time.
+        // Without motion, windows are equal in time.
         let at = if total > 0.0 {
             moved / total
         } else {
@@ -378,7 +382,7 @@ fn choose(frames: &[Frame], wanted: usize) -> Vec<usize> {
     best.into_iter().flatten().collect()
 }
 
-/// The expression by which ffmpeg selects frames: a balanced sum, since it evaluates no more than a hundred terms in a row.
+/// The expression by which ffmpeg selects frames: a balanced sum, since it evaluates at most a hundred terms in a row.
 fn is_one_of(frames: &[usize]) -> String {
     match frames {
         [] => "0".to_owned(),
@@ -390,7 +394,7 @@ fn is_one_of(frames: &[usize]) -> String {
     }
 }
 
-/// Writes the chosen frames, ascending, under their names.
+/// Writes the chosen frames, which are in ascending order, under their names.
 fn extract(chosen: &Chosen, folder: &Path) -> Result<(), RunError> {
     let film = &chosen.film;
     let output = Command::new("ffmpeg")
@@ -398,11 +402,11 @@ fn extract(chosen: &Chosen, folder: &Path) -> Result<(), RunError> {
         .arg(file_url(film))
         .args([
             "-vf",
-            // Pixels that are not square (DV, anamorphic) become so: the cameras have one focal length.
+            // Non-square pixels (DV, anamorphic) are made square: the cameras have one focal length.
             &format!("select='{}',scale=iw*sar:ih", is_one_of(&chosen.frames)),
         ])
         .args([frame_option(&ffmpeg_version().unwrap_or_default()), "passthrough"])
-        // A pattern: the folder's own name may hold a `%`.
+        // A relative pattern, since the path of the folder may contain a `%`.
         .args(["-q:v", "2", "-start_number", "0", "chosen_%06d.jpg"])
         .current_dir(folder)
         .stdin(Stdio::null())
@@ -459,7 +463,7 @@ mod tests {
         let still: Vec<Frame> = frames[..300].to_vec();
         assert_eq!(choose(&still, 100).len(), 100);
         assert_eq!(choose(&frames[..40], 100).len(), 40);
-        // A minute of walking and a second of standing still share what both ask for.
+        // A moving film and a still one share the total.
         assert_eq!(shares(&[frames, still.clone()]), [300, LEAST]);
         assert_eq!(shares(&[still.clone(), still]), [50, 50]);
     }

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 /// Cameras and poses of a dataset in COLMAP's format.
 pub(super) struct KnownPoses {
     data: PathBuf,
-    /// The folder of its model.
+    /// The folder of the dataset's model.
     pub model: PathBuf,
     cameras: HashMap<u32, ColmapCamera>,
     images: HashMap<String, ColmapImage>,
@@ -31,7 +31,7 @@ impl KnownPoses {
         })
     }
 
-    /// The photographs in the dataset's folder `images` and the folders in it that hold some with a pose, by their names in the model.
+    /// The photographs in `images` and its subfolders, under their names in the model; folders without posed photographs are skipped.
     fn photographs(&self) -> Result<PhotoFolder, RunError> {
         let images = self.data.join("images");
         let folders = self.images.keys().map(|name| images.join(name));
@@ -58,7 +58,7 @@ impl KnownPoses {
         if let Some(name) = self.images.keys().filter(|name| !present(name)).min() {
             let unused = folder.unused().find(|(unused, _)| unused == name);
             let why = match unused {
-                Some((_, reason)) => format!("which is left out of its folder images ({reason})"),
+                Some((_, reason)) => format!("which is in its folder images but cannot be used ({reason})"),
                 None => "which is not in its folder images: add the photograph there".to_owned(),
             };
             let message = format!("{} has a pose for {name}, {why}", self.data.display());
@@ -86,7 +86,7 @@ impl KnownPoses {
             let reasons = folder.left_out.iter().take(3);
             let reasons: String = reasons.map(|(name, reason)| format!("; {name}: {reason}")).collect();
             return Err(RunError::Refused(format!(
-                "there is no photograph to add that {} does not have{reasons}",
+                "there is no photograph to add that {} does not already have{reasons}",
                 self.data.display()
             )));
         }
@@ -94,8 +94,8 @@ impl KnownPoses {
         Ok(folder)
     }
 
-    /// What is known of `photos`, whose groups become those of the dataset's cameras: new photographs join the camera of those that have
-    /// the same metadata.
+    /// The known poses and cameras of `photos`, whose groups are replaced by those of the dataset's cameras: new photographs join the
+    /// camera of photographs with the same metadata.
     pub fn of(&self, photos: &mut [PhotoInfo]) -> Result<Known, RunError> {
         let of_photo: Vec<Option<&ColmapImage>> = photos.iter().map(|photo| self.images.get(&photo.name)).collect();
         for (photo, image) in photos.iter().zip(&of_photo) {
@@ -108,7 +108,8 @@ impl KnownPoses {
             ];
             if size != of_camera {
                 return Err(RunError::Refused(format!(
-                    "{} of {} is {}x{}, its camera {}x{}: photographs are added to those at the size of their cameras, turned as these are",
+                    "{} of {} is {}x{}, but its camera {}x{}: photographs can only be added if those of the dataset have the size and \
+                     orientation of their cameras",
                     photo.name,
                     self.data.display(),
                     size[0],

@@ -1,4 +1,4 @@
-//! Views of a dataset as the mapper takes them: with their features, cameras and poses.
+//! Views of a dataset in the form that the mapper needs: with their features, cameras and poses.
 
 use super::stages::{both, color_at, in_grey};
 use irradia_scene::{Camera, View};
@@ -10,7 +10,7 @@ use irradia_sfm::map::PhotoInfo;
 
 /// A view at the size at which its features were found.
 pub(super) struct Look {
-    /// With a camera of its own, in group 0.
+    /// The photograph's camera is known; the group is 0.
     pub info: PhotoInfo,
     pub features: Features,
     /// The photograph's colour at each feature.
@@ -18,7 +18,7 @@ pub(super) struct Look {
 }
 
 impl Look {
-    /// Looks at `view`, whose longer side has at most `side` pixels then; `None` if its photograph cannot be read.
+    /// Finds the features of `view`, reduced to at most `side` pixels on its longer side; `None` if its photograph cannot be read.
     pub fn at(view: &View, side: u32, max_features: usize) -> Option<Self> {
         let full = view.camera.intrinsics;
         let k = full.scaled((side as f32 / full.width.max(full.height) as f32).min(1.0));

@@ -1,14 +1,14 @@
 //! Photographs and films in, a posed dataset out.
 //!
 //! ```text
-//! images/          the posed photographs: links to the originals where the file system allows, else copies
-//! frames/, faces/  frames of films, and faces of panoramas with these themselves, which images/ links to
+//! images/          the posed photographs: links to the originals where the file system allows, otherwise copies
+//! frames/, faces/  frames of films; panoramas and their faces; images/ links to both
 //! sparse/0/*.bin   cameras, poses and points with tracks, in COLMAP's format; further models in sparse/1, ..
-//! pose.json        what happened: numbers, times, and each photograph left out with its reason
+//! pose.json        the report: numbers, times, and each photograph left out with its reason
 //! doctor.html      what is wrong with the capture, and where to take further photographs; doctor.json and doctor/*.png belong to it
-//! masks/           those of the photographs, or of what stands still in them while the rest moves
-//! features.bin     features and matches, which are reused as long as photographs do not change; features-masked.bin: those of what moves;
-//!                  features-more.bin: those of a second attempt
+//! masks/           masks of the photographs, or of what stands still in them while the rest moves
+//! features.bin     features and matches, reused as long as photographs do not change; features-masked.bin: those found with masks of what
+//!                  stands still; features-more.bin: those of a second attempt
 //! ```
 
 mod attempt;
@@ -48,38 +48,38 @@ use film::is_film;
 pub use film::is_film_name;
 pub(crate) use points::{are_missing, find_points};
 
-/// The fraction of the photographs that should have a pose: below it, a second attempt is made, and no training begins unasked.
+/// The fraction of the photographs that should have a pose: below it, a second attempt is made, and training does not start automatically.
 pub const ENOUGH_POSED: f64 = 0.8;
-/// Fewer photographs make no dataset.
+/// Minimum number of photographs of a dataset.
 const MIN_PHOTOS: usize = 3;
-/// The report's name.
+/// File name of the report.
 const REPORT: &str = "pose.json";
 
 /// A request for poses.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PoseInput {
-    /// Folders of photographs and films, and films; what a folder without any holds in its folders.
+    /// Folders of photographs and films, and films. If a folder has neither, its subfolders are searched.
     pub photos: Vec<PathBuf>,
     /// The folder of the dataset; created if missing.
     pub out: PathBuf,
-    /// File names of the photographs that are used, where all of them are found; others that lie beside them are ignored. All if `None`.
+    /// File names of the photographs to use; others beside them are ignored. Has no effect unless all of them are found. `None`: all.
     pub only: Option<HashSet<String>>,
-    /// Whether the photographs are added to the dataset in `out`, in COLMAP's format, whose poses and cameras stay as they are.
+    /// Whether to add the photographs to the dataset in `out`, in COLMAP's format, whose poses and cameras do not change.
     pub into: bool,
-    /// Distances between cameras that are known; they bring the poses to metres.
+    /// Known distances between cameras, by which the poses are scaled to metres.
     pub distances: Vec<KnownDistance>,
-    /// Who finds the poses.
+    /// The program that finds the poses.
     pub mapper: Mapper,
-    /// The program that [`Mapper::Colmap`] runs.
+    /// The executable that [`Mapper::Colmap`] runs.
     pub colmap: String,
-    /// The most features of a photograph, at least 1; by the number of photographs if `None`.
+    /// Maximum number of features per photograph, at least 1; depends on the number of photographs if `None`.
     pub max_features: Option<usize>,
-    /// How to verify and map.
+    /// Options of verification and mapping.
     pub mapping: MapOptions,
 }
 
 impl PoseInput {
-    /// With the usual options.
+    /// A request with the default options.
     pub fn new(photos: impl Into<PathBuf>, out: impl Into<PathBuf>) -> Self {
         Self {
             photos: vec![photos.into()],
@@ -104,13 +104,13 @@ pub struct KnownDistance {
     pub metres: f64,
 }
 
-/// Who finds poses.
+/// The program that finds poses.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Mapper {
     /// This program.
     #[default]
     Irradia,
-    /// COLMAP, which must be installed; photographs that it leaves out have no other reason.
+    /// COLMAP, which must be installed; it gives no reason for the photographs that it leaves out.
     Colmap,
 }
 
@@ -121,7 +121,7 @@ pub enum PoseProgress {
     Stage {
         /// `frames`, `features`, `matches` or `poses`.
         name: &'static str,
-        /// Steps of the stage: photographs or pairs; 0 if their number is unknown, as of a film's frames.
+        /// Steps of the stage: photographs or pairs; 0 if their number is unknown, as for the frames of a film.
         of: usize,
     },
     /// This many steps of the stage are done.
@@ -130,72 +130,72 @@ pub enum PoseProgress {
     Warned(String),
 }
 
-/// What became of the photographs; `pose.json`.
+/// The result of [`pose`]; `pose.json`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct PoseReport {
-    /// Pictures found.
+    /// Number of photographs found.
     pub photos: usize,
-    /// Photographs with a pose in the largest model.
+    /// Number of photographs with a pose in the largest model.
     pub registered: usize,
-    /// Photographs without one.
+    /// Photographs without a pose in the largest model.
     pub left_out: Vec<LeftOutPhoto>,
-    /// Photographs of each model, largest first; they share no world.
+    /// Number of photographs of each model, largest first; each model has its own world.
     pub models: Vec<usize>,
-    /// Points of the largest model.
+    /// Number of points of the largest model.
     pub points: usize,
-    /// Its mean reprojection error, px; 0 if COLMAP found it.
+    /// Mean reprojection error of the largest model, px; 0 if COLMAP found it.
     pub mean_error_px: f64,
-    /// How its unit, a metre, was found; `None` if the unit is arbitrary.
+    /// How the largest model was scaled to metres; `None` if its unit is arbitrary.
     pub scale: Option<ScaleReport>,
-    /// Its cameras.
+    /// Cameras of the largest model.
     pub cameras: Vec<CameraReport>,
-    /// What was tried: a second time, with frontal descriptors, where too few photographs had a pose. It was written if it has more
-    /// poses, by a twentieth of the photographs, and half of them.
+    /// The searches for poses. A second one, with frontal descriptors, is made if too few photographs have a pose or if pairs contradict
+    /// the model of few photographs; [`pose`] says when it replaces the first.
     pub attempts: Vec<AttemptReport>,
-    /// Pairs of photographs that were matched.
+    /// Number of pairs of photographs that were matched.
     pub pairs: usize,
-    /// Pairs with a common geometry.
+    /// Number of pairs with a common geometry.
     pub verified_pairs: usize,
-    /// Seconds by stage, in their order.
+    /// Seconds per stage, in order.
     pub stages: Vec<StageReport>,
-    /// Seconds in all.
+    /// Total seconds.
     pub seconds: f64,
-    /// What the user should know.
+    /// Warnings for the user.
     pub warnings: Vec<String>,
-    /// What is wrong with the capture, the gravest first.
+    /// What is wrong with the capture, the most serious first.
     pub findings: Vec<Finding>,
-    /// Who found the poses.
+    /// The program that found the poses.
     pub poses_by: PosesBy,
 }
 
-/// Who found the poses of a dataset.
+/// The program that found the poses of a dataset.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PosesBy {
-    /// This program, which has examined them.
+    /// This program, which has checked them.
     #[default]
     Irradia,
-    /// COLMAP, which this program ran.
+    /// COLMAP, run by this program.
     Colmap,
-    /// Others, and this program those of photographs that were added.
+    /// Another program; this one found the poses of photographs that were added.
     Others,
 }
 
 /// One search for poses; [`PoseReport::attempts`].
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct AttemptReport {
-    /// The most features of a photograph.
+    /// Maximum number of features per photograph.
     pub max_features: usize,
-    /// Whether features were also matched as they look from the front.
+    /// Whether features were also matched by frontal descriptors.
     pub frontal: bool,
-    /// Photographs with a pose in its largest model.
+    /// Number of photographs with a pose in its largest model.
     pub registered: usize,
-    /// What it warned of.
+    /// Its warnings.
     pub warnings: Vec<String>,
 }
 
 impl PoseReport {
-    /// The fraction of the pictures that have a pose.
+    /// The fraction of the photographs that have a pose.
     pub fn fraction(&self) -> f64 {
         self.registered as f64 / self.photos.max(1) as f64
     }
@@ -210,7 +210,7 @@ pub struct LeftOutPhoto {
     pub reason: String,
 }
 
-/// Names with the same reason together, each `(name, reason)` of `named`; in the order of the first of each.
+/// Groups the names of `named`, each a `(name, reason)`, by reason; reasons are in the order of their first occurrence.
 pub fn by_reason<'a>(named: impl Iterator<Item = (&'a str, &'a str)>) -> Vec<(&'a str, Vec<&'a str>)> {
     let mut reasons: Vec<(&str, Vec<&str>)> = Vec::new();
     for (name, reason) in named {
@@ -225,53 +225,58 @@ pub fn by_reason<'a>(named: impl Iterator<Item = (&'a str, &'a str)>) -> Vec<(&'
 /// A camera of the largest model.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct CameraReport {
-    /// Its photographs.
+    /// Number of its photographs.
     pub photos: usize,
     /// Width and height, px.
     pub size: [u32; 2],
-    /// Mean of both axes, px.
+    /// Focal length, mean of both axes, px.
     pub focal_px: f64,
-    /// The principal point, px: the middle, unless photographs were cut out of larger ones.
+    /// Principal point, px: the image centre, unless photographs are crops of larger ones.
     pub principal_px: [f64; 2],
-    /// Whether the metadata of its photographs tell the focal length.
+    /// Whether the metadata of its photographs contain the focal length.
     pub focal_known: bool,
-    /// Whether the focal length was held, because nothing in the photographs determines it.
+    /// Whether the focal length was fixed because nothing in the photographs determines it.
     pub focal_held: bool,
 }
 
-/// The scale of a model in metres, by the places in the photographs' metadata, so that +X is east and +Y north, or by known distances.
+/// The scale of a model in metres, determined by the GPS positions of the photographs (+X is then east and +Y north) or by known distances.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct ScaleReport {
-    /// Known distances that determine the scale; 0 if the places do.
+    /// Number of known distances that determine the scale; 0 if GPS positions do.
     pub distances: usize,
-    /// Photographs whose places agree with the model.
+    /// Number of photographs whose GPS positions agree with the model.
     pub photos: usize,
-    /// Posed photographs that tell their place.
+    /// Number of posed photographs that have a GPS position.
     pub with_place: usize,
-    /// Root mean square of the horizontal distances between places and the model, m.
+    /// Root mean square residual, m: of horizontal distances between GPS positions and the model, or of known distances.
     pub residual_m: f64,
-    /// Relative standard deviation of the scale. That of a single distance is what the poses contribute: how well it was measured
-    /// shows only when there are several.
+    /// Relative standard deviation of the scale. With a single distance it contains only the contribution of the poses: how well distances
+    /// were measured shows only if there are several.
     pub scale_error: f64,
 }
 
-/// Time of a stage.
+/// The time that a stage took.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct StageReport {
-    /// `photographs` (with frames of films and faces of panoramas), `features`, `matches`, `masks`, `poses`, `doctor`, `writing` or `colmap`.
+    /// `photographs` (including frames of films and faces of panoramas), `features`, `matches`, `masks`, `poses`, `doctor`, `writing` or
+    /// `colmap`.
     pub name: &'static str,
     /// Wall time.
     pub seconds: f64,
 }
 
-/// Finds the poses of photographs and writes them as a dataset. Features and matches of an earlier call are reused. Where fewer than [`ENOUGH_POSED`] of
-/// the photographs have a pose at first, or any of up to 25 has none, or pairs of them contradict the model, it tries again with frontal descriptors; a model that is
-/// larger by a twentieth of the photographs and holds half of them, or as large and contradicted half as often, replaces the first. The result depends neither on the number of threads nor on the order of the files.
+/// Finds the poses of photographs and writes them as a dataset. Features and matches of an earlier call are reused.
+///
+/// If fewer than [`ENOUGH_POSED`] of the photographs have a pose at first, or any of up to 25 photographs has none, or pairs of up to 25
+/// contradict the model, a second attempt is made with frontal descriptors. Its model replaces the first one if it is larger by a
+/// twentieth of the photographs and contains half of them, or if it is as large and contradicted half as often.
+///
+/// The result depends neither on the number of threads nor on the order of the files.
 ///
 /// # Errors
 /// When there are fewer than three photographs, a film cannot be read, no three photographs can be posed together, a distance is not
-/// between two posed photographs, `out` holds a dataset of another origin, or none where photographs are to be added to it, or a file
-/// cannot be written.
+/// between two posed photographs, `out` contains a dataset that was not written by this function, or no dataset to which photographs
+/// could be added, or a file cannot be written.
 pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Result<PoseReport, RunError> {
     let started = Instant::now();
     if input.max_features == Some(0) {
@@ -281,7 +286,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
         return Err(RunError::setting(
             "into",
             input.out.display(),
-            "keeps its unit: leave --distance out",
+            "adding photographs does not change the unit: leave out --distance",
         ));
     }
     let out = &input.out;
@@ -307,7 +312,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
             return Err(RunError::setting(
                 "into",
                 out.display(),
-                "takes no panoramas: pose all photographs anew, with --out",
+                "panoramas cannot be added to a dataset: pose all photographs again, with --out",
             ));
         }
         capture.folder = known.with(capture.folder)?;
@@ -322,14 +327,14 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
             return Err(RunError::setting(
                 "mapper",
                 "colmap",
-                "leaves its unit as it is: leave --distance or --poses colmap out",
+                "COLMAP's poses are not scaled: leave out --distance or --poses colmap",
             ));
         }
         if input.into {
             return Err(RunError::setting(
                 "mapper",
                 "colmap",
-                "adds nothing to a dataset: leave --into or --poses colmap out",
+                "COLMAP cannot add photographs to a dataset: leave out --into or --poses colmap",
             ));
         }
         let mut report = colmap::run(input, &capture, progress)?;
@@ -368,7 +373,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
             false => "",
         };
         progress(PoseProgress::Warned(format!(
-            "{why}: trying again with up to {most} features of each, matched from the front{guided}",
+            "{why}: trying again with up to {most} features per photograph, matched by frontal descriptors{guided}",
         )));
         let again = Matched::find(work, &capture, masked.is_some(), &mut clock)?;
         let again = again.map(&input.mapping, None, &mut clock, progress)?;
@@ -398,7 +403,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     } = attempt;
     reconstruction.regroup(&mut infos);
     let scale = match reconstruction.models.first_mut() {
-        // What is known keeps its unit.
+        // Known poses keep their unit.
         Some(model) if is_new => {
             let by_places = place::scale(folder, &mut work, model);
             place::scale_by_distances(&input.distances, &infos, &mut work, model)?.or(by_places)
@@ -436,11 +441,11 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     Ok(report)
 }
 
-/// Who found the poses in `data`, if [`pose`] wrote the model there, or added to it.
+/// The program that found the poses in `data`, if [`pose`] wrote the model there or added to it.
 pub fn poses_by(data: &Path) -> Option<PosesBy> {
     #[derive(Deserialize)]
     struct Known {
-        // Earlier versions did not say.
+        // Missing in reports of earlier versions.
         #[serde(default)]
         poses_by: PosesBy,
     }
@@ -448,14 +453,14 @@ pub fn poses_by(data: &Path) -> Option<PosesBy> {
     Some(serde_json::from_slice::<Known>(&report).map_or(PosesBy::Irradia, |known| known.poses_by))
 }
 
-/// Refuses to replace a model that [`pose`] did not write.
+/// Rejects an output folder with a model that [`pose`] did not write.
 fn check_free(out: &Path) -> Result<(), RunError> {
     let foreign = ["sparse", "transforms.json", "transforms_train.json", "poses_bounds.npy"]
         .into_iter()
         .find(|name| out.join(name).exists() && matches!(poses_by(out), None | Some(PosesBy::Others)));
     match foreign {
         Some(name) => Err(RunError::Refused(format!(
-            "{} already holds {name} of another origin: choose another --out",
+            "{} already contains {name} from another source: choose another --out",
             out.display()
         ))),
         None => Ok(()),
@@ -478,14 +483,14 @@ fn check_enough(paths: &[PathBuf], folder: &PhotoFolder) -> Result<(), RunError>
     )))
 }
 
-/// Paths for a message.
+/// Paths as text for a message.
 fn joined(paths: &[PathBuf]) -> String {
     let paths: Vec<String> = paths.iter().map(|path| path.display().to_string()).collect();
     paths.join(", ")
 }
 
-/// Why nothing could be posed, and what to do: masks or too little texture if more than half of the photographs have these, else what the doctor says of the whole, else the
-/// first photograph's reason.
+/// Why nothing could be posed, and what to do: masks or too little texture if these affect more than half of the photographs, otherwise the
+/// doctor's first finding other than a left-out photograph, otherwise the first photograph's reason.
 fn no_model(paths: &[PathBuf], photos: &[PhotoInfo], found: &Reconstruction, examined: &DoctorReport) -> String {
     let count = |kind: Kind| {
         examined
@@ -507,8 +512,8 @@ fn no_model(paths: &[PathBuf], photos: &[PhotoInfo], found: &Reconstruction, exa
             )
         }
         _ if 2 * smooth > photos.len() => format!(
-            "{smooth} show little texture, or are out of focus; put something textured, such as a newspaper, under or around what they show, \
-             or go nearer"
+            "{smooth} show little texture, or are out of focus; put something textured, such as a newspaper, under or around the subject, \
+             or move closer"
         ),
         (Some(finding), _) => format!("{}; {overlap}", finding.sentence),
         (None, Some(left)) => format!("{}: {}; {overlap}", photos[left.photo].name, left.reason),
@@ -521,7 +526,7 @@ fn no_model(paths: &[PathBuf], photos: &[PhotoInfo], found: &Reconstruction, exa
     )
 }
 
-/// Times stages.
+/// Measures the time of each stage.
 struct Clock {
     last: Instant,
     stages: Vec<StageReport>,
@@ -535,7 +540,7 @@ impl Clock {
         }
     }
 
-    /// Counts the time since the last stage's end for `name`.
+    /// Adds the time since the end of the last stage to stage `name`.
     fn end(&mut self, name: &'static str) {
         let seconds = self.last.elapsed().as_secs_f64();
         match self.stages.iter_mut().find(|stage| stage.name == name) {

@@ -1,4 +1,4 @@
-//! The dataset that was reconstructed.
+//! Writing of the reconstructed dataset and its report.
 
 use super::brought;
 use super::stages::Work;
@@ -14,8 +14,8 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-/// Writes `images` and `sparse`, or in place of the model in the folder `into`, to which photographs were added. Without it, what an earlier call brought of other
-/// photographs is put away.
+/// Writes `images` and `sparse`, or replaces the model in the folder `into`, to which photographs were added. Without `into`, files of
+/// other photographs that an earlier call brought are put away.
 pub(super) fn write(
     out: &Path,
     folder: &PhotoFolder,
@@ -45,7 +45,7 @@ pub(super) fn write(
     brought::record(out, &posed, into.is_some())
 }
 
-/// An empty folder for models, beside those of an earlier call, which may have been more and remain until these are complete.
+/// An empty folder for models, beside those of an earlier call, which may be more and remain until the new ones are complete.
 pub(super) fn begin_models(out: &Path) -> Result<PathBuf, RunError> {
     let written = out.join("sparse.new");
     if written.exists() {
@@ -55,7 +55,7 @@ pub(super) fn begin_models(out: &Path) -> Result<PathBuf, RunError> {
     Ok(written)
 }
 
-/// Puts the complete models of [`begin_models`] into their place.
+/// Moves the complete models of [`begin_models`] into place.
 pub(super) fn end_models(out: &Path, written: &Path) -> Result<(), RunError> {
     let sparse = out.join("sparse");
     fs::remove_dir_all(&sparse)
@@ -64,7 +64,8 @@ pub(super) fn end_models(out: &Path, written: &Path) -> Result<(), RunError> {
     fs::rename(written, &sparse).map_err(RunError::io("rename", written))
 }
 
-/// Puts the first model of `written` in place of that in the folder `model`, which is put away if another program made it. Other models and files stay.
+/// Replaces the model in the folder `model` by the first one of `written`. The old model is put away if another program made it; other
+/// models and files stay.
 fn replace_model(out: &Path, model: &Path, written: &Path) -> Result<(), RunError> {
     let tables = ["cameras", "images", "points3D", "rigs", "frames"];
     let names = tables
@@ -75,7 +76,7 @@ fn replace_model(out: &Path, model: &Path, written: &Path) -> Result<(), RunErro
         let place = model.strip_prefix(out).unwrap_or(model);
         let files = names.iter().map(|name| place.join(name).to_string_lossy().into_owned());
         brought::put_away(out, files)?;
-        // It went with the last of its files.
+        // The folder was removed with the last of its files.
         fs::create_dir_all(model).map_err(RunError::io("create", model))?;
     }
     for name in names {
@@ -90,7 +91,7 @@ fn replace_model(out: &Path, model: &Path, written: &Path) -> Result<(), RunErro
     fs::remove_dir_all(written).map_err(RunError::io("clear", written))
 }
 
-/// What is not there need not be removed.
+/// Ignores the error that a file to remove does not exist.
 fn absent(error: io::Error) -> io::Result<()> {
     match error.kind() {
         io::ErrorKind::NotFound => Ok(()),
@@ -163,7 +164,7 @@ pub(super) fn mean_color(point: &ModelPoint, colors: &[Vec<[u8; 3]>]) -> [u8; 3]
     sum.map(|sum| ((sum + count / 2) / count) as u8)
 }
 
-/// The simplest of COLMAP's models that the camera fits in.
+/// The simplest of COLMAP's camera models that represents the camera.
 fn colmap_camera(id: u32, camera: &DCamera) -> ColmapCamera {
     let [fx, fy, cx, cy, k1, k2, p1, p2] = camera.parameters;
     let (model, params) = if camera.fisheye {
@@ -182,7 +183,7 @@ fn colmap_camera(id: u32, camera: &DCamera) -> ColmapCamera {
     }
 }
 
-/// All but the times and warnings.
+/// The report without times, warnings, findings, scale, attempts and the number of matched pairs, which the caller adds.
 pub(super) fn report(folder: &PhotoFolder, work: &Work, infos: &[PhotoInfo], found: &Reconstruction) -> PoseReport {
     let model = &found.models[0];
     let unused = folder.unused().chain(work.undecodable());

@@ -1,4 +1,4 @@
-//! Metres from what the photographs' metadata say of their places, or from known distances.
+//! Scale in metres from the GPS positions in the photographs' metadata, or from known distances.
 
 use super::stages::Work;
 use super::{KnownDistance, ScaleReport};
@@ -11,10 +11,12 @@ use irradia_sfm::map::{Distance, Model, PhotoInfo, to_distances, to_metres};
 const RADIUS_M: f64 = 6_378_137.0;
 const ECCENTRICITY_SQUARED: f64 = 6.694_379_990_14e-3;
 
-/// The ratio between known distances from which on they contradict each other: a tape measure is better, and what is left is of the poses.
+/// Known distances contradict each other if their scales differ by more than this ratio: a tape measure is more precise, and poses account
+/// for smaller differences.
 const CONTRADICTS: f64 = 1.1;
 
-/// Brings `model` to metres if enough photographs tell their place, and tells what is known of its scale; warns where that is too little.
+/// Scales `model` to metres if enough photographs have a GPS position, and reports the scale; warns if the positions do not determine it
+/// well enough.
 pub(super) fn scale(folder: &PhotoFolder, work: &mut Work, model: &mut Model) -> Option<ScaleReport> {
     let gps: Vec<Option<[f64; 3]>> = work.photos().iter().map(|i| folder.photos[*i].tags.gps).collect();
     match to_metres(model, &local(&gps)) {
@@ -27,7 +29,7 @@ pub(super) fn scale(folder: &PhotoFolder, work: &mut Work, model: &mut Model) ->
         }),
         Err(Some(error)) => {
             work.warn(Some(format!(
-                "the places of the photographs leave the scale open by {:.0} %: the unit of the poses is arbitrary",
+                "the GPS positions leave the scale uncertain by {:.0} %: the unit of the poses is arbitrary",
                 100.0 * error.min(10.0)
             )));
             None
@@ -36,7 +38,7 @@ pub(super) fn scale(folder: &PhotoFolder, work: &mut Work, model: &mut Model) ->
     }
 }
 
-/// Refuses distances that cannot be used, before anything else is done.
+/// Rejects distances that cannot be used, before any work is done.
 pub(super) fn check(distances: &[KnownDistance], folder: &PhotoFolder) -> Result<(), RunError> {
     for distance in distances {
         let [a, b] = &distance.photos;
@@ -59,7 +61,7 @@ fn refused(distance: &KnownDistance, message: String) -> RunError {
     RunError::setting("distance", format!("{a},{b},{}", distance.metres), message)
 }
 
-/// Brings `model` to metres by known distances, and warns of one that contradicts the others; `None` if there are none.
+/// Scales `model` to metres by known distances, and warns of one that contradicts the others; `None` if no distances are given.
 pub(super) fn scale_by_distances(
     distances: &[KnownDistance],
     infos: &[PhotoInfo],
@@ -102,7 +104,7 @@ pub(super) fn scale_by_distances(
         }
         None => Err(refused(
             &distances[0],
-            "the two were taken from one place, as far as can be told: name photographs that are farther apart"
+            "both photographs appear to have been taken from the same place: name photographs that are farther apart"
                 .to_owned(),
         )),
     }
@@ -116,7 +118,7 @@ fn length(model: &Model, distance: &Distance) -> f64 {
     a.distance(b)
 }
 
-/// The warning about the distance whose ratio to the model is farthest from the median, if it is far.
+/// A warning about the distance whose ratio to the model is farthest from the median, if it differs by more than [`CONTRADICTS`].
 fn contradicting(distances: &[KnownDistance], ratios: &[f64]) -> Option<String> {
     let mut sorted = ratios.to_vec();
     sorted.sort_unstable_by(f64::total_cmp);
@@ -126,18 +128,19 @@ fn contradicting(distances: &[KnownDistance], ratios: &[f64]) -> Option<String> 
     let [a, b] = &distance.photos;
     (off.ln().abs() > CONTRADICTS.ln()).then(|| {
         format!(
-            "the distance {a},{b},{} is {off:.2} times what the other distances say: one of them is wrong, and the scale with it",
+            "the distance {a},{b},{} is {off:.2} times what the other distances imply: one of them is wrong, and so is the scale",
             distance.metres
         )
     })
 }
 
-/// East, north and up, m, of latitudes, longitudes and altitudes, about their median: on the plane that touches the earth there. A place far away, as some
-/// cameras write before they know theirs, must not move it: away from the photographs' latitude, metres along the parallel have another length.
+/// East, north and up, m, of latitudes, longitudes and altitudes, on the plane tangent to the earth at their median. The median, because a
+/// distant position, as some cameras write before they have a fix, must not move that point: at another latitude, a degree along the
+/// parallel has another length.
 fn local(gps: &[Option<[f64; 3]>]) -> Vec<Option<DVec3>> {
     let known: Vec<&[f64; 3]> = gps.iter().flatten().collect();
     let [latitude, altitude] = [0, 2].map(|k| middle(known.iter().map(|place| place[k])));
-    // From the first place, across the date line as well.
+    // Relative to the first position, so that positions may straddle the date line.
     let first = known.first().map_or(0.0, |place| place[1]);
     let around = |from: f64, longitude: f64| (longitude - from + 540.0).rem_euclid(360.0) - 180.0;
     let longitude = first + middle(known.iter().map(|place| around(first, place[1])));
@@ -156,7 +159,7 @@ fn local(gps: &[Option<[f64; 3]>]) -> Vec<Option<DVec3>> {
     gps.iter().map(|known| known.map(place)).collect()
 }
 
-/// The median of `values`; 0 of none.
+/// The median of `values`; 0 if there are none.
 fn middle(values: impl Iterator<Item = f64>) -> f64 {
     let mut values: Vec<f64> = values.collect();
     values.sort_unstable_by(f64::total_cmp);
@@ -182,7 +185,7 @@ mod tests {
             (d.x - 78_847.0).abs() < 10.0 && (d.y - 111_132.0).abs() < 10.0 && d.z == 200.0,
             "{d}"
         );
-        // One at the equator, as before the camera knows its place, changes nothing.
+        // A position at the equator, as written before the camera has a fix, changes nothing.
         let place = |east: f64| Some([45.0, 7.0 + east, 100.0]);
         let places = local(&[place(0.0), Some([0.0, 1.0, 0.0]), place(0.5), place(1.0), place(0.5)]);
         let [Some(a), _, _, Some(b), _] = places[..] else {

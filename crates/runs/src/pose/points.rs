@@ -1,7 +1,7 @@
-//! Points of a dataset that has poses and no points: matches of its training photographs, triangulated.
+//! Points for a dataset that has poses but no points: triangulated matches of its training photographs.
 //!
-//! Datasets of LLFF, of instant-ngp or by a phone's tracking have none. Splats then begin at random positions, and nothing tells what is empty: the same
-//! photographs of fox at 540x960, by the same recipe in the same time, are 2 dB worse (RESULTS.md).
+//! Datasets of LLFF, of instant-ngp or from a phone's tracking have no points. Splats then begin at random positions, and nothing shows
+//! which space is empty: the same photographs of fox at 540x960, by the same recipe in the same time, are 2 dB worse (RESULTS.md).
 
 use super::look::{Look, pose};
 use super::output::mean_color;
@@ -12,21 +12,24 @@ use irradia_sfm::map::{Known, MapOptions, PhotoInfo, add_guided_points, extend};
 use irradia_sfm::matching::{MatchOptions, PairOptions, candidate_pairs, match_pairs};
 use rayon::prelude::*;
 
-/// Training photographs that are matched; of more, evenly spaced ones.
+/// Maximum number of training photographs that are matched; if there are more, evenly spaced ones.
 const PHOTOGRAPHS: usize = 400;
-/// Fewer points than these say little of where surfaces are.
+/// Minimum number of points: fewer say little about where surfaces are.
 const FEWEST: usize = 200;
-/// Photographs up to which features are matched along epipolar lines as well. Held-out PSNR of the default run on 12 photographs with known poses, three seeds,
-/// without and with: fox 28.30, 28.70 dB; cup 24.36, 24.80; can 29.12, 28.96; plush bear 26.50, 26.78; plush toy 24.85, 25.16. Of 24 no more than 0.1.
+/// Maximum number of photographs whose features are also matched along epipolar lines. Held-out PSNR of the default run on 12 photographs
+/// with known poses, three seeds, without and with: fox 28.30, 28.70 dB; cup 24.36, 24.80; can 29.12, 28.96; plush bear 26.50, 26.78; plush
+/// toy 24.85, 25.16. With 24 photographs it gains no more than 0.1 dB.
 const GUIDED: usize = 25;
 
-/// Whether points of `dataset` can be found: it has none, nor is it rendered, where what is empty is known and poses may be any.
+/// Whether points should be found for `dataset`: it has none and was not rendered. In rendered datasets, empty space is known, and poses
+/// may be arbitrary.
 pub(crate) fn are_missing(dataset: &Dataset) -> bool {
     dataset.points.as_ref().is_none_or(PointCloud::is_empty) && dataset.kind != "Blender"
 }
 
-/// Points of `dataset` from matches of its training photographs, in its world, told to the views that show them; their number, or `None` if they are too few
-/// and the dataset is as it was. `larger` has the same views with more pixels. Held-out photographs are not used.
+/// Adds points from matches of the training photographs to `dataset`, in its world, and records in each view which of them it shows.
+/// Returns their number, or `None` if there are too few, in which case the dataset is unchanged. `larger` has the same views with more
+/// pixels. Held-out photographs are not used.
 pub(crate) fn find_points(dataset: &mut Dataset, larger: Option<&Dataset>) -> Option<usize> {
     let step = dataset.train.len().div_ceil(PHOTOGRAPHS).max(1);
     let chosen: Vec<usize> = dataset.train.iter().copied().step_by(step).collect();

@@ -1,4 +1,4 @@
-//! Features and matches, with those of an earlier call.
+//! Finding of features and matches, which reuses those of an earlier call.
 
 use super::store::{self, Known, Looks, Settings};
 use super::{ENOUGH_POSED, PoseProgress};
@@ -15,50 +15,50 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-/// Pairs that are matched between two looks at the clock.
+/// Number of pairs that are matched between two checks of the time.
 const BATCH: usize = 1000;
 /// How often matches are saved while pairs are matched.
 const SAVED_EVERY: Duration = Duration::from_secs(60);
 
-/// The file of features and matches, of those of a second attempt, and of those of what does not stand still.
+/// Files of features and matches: of the first attempt, of a second one, and of photographs in which what stands still is masked.
 const STORE: &str = "features.bin";
 const STORE_OF_MORE: &str = "features-more.bin";
 const STORE_OF_MASKED: &str = "features-masked.bin";
 
-/// Photographs up to which each has so many features, since a scene of few photographs has few points otherwise, and matching them costs little: splats
-/// that begin from them end 0.7 dB better on lund_door, 12 photographs.
+/// Numbers of photographs, and the maximum number of features if there are at most that many: a scene of few photographs has few points
+/// otherwise, and matching costs little. Splats that begin from these points end 0.7 dB better on lund_door, 12 photographs.
 const MANY_FEATURES: [(usize, usize); 2] = [(25, 8192), (35, 6144)];
 
-/// The most features of each of so many photographs, unless a number is `wanted`.
+/// Maximum number of features per photograph: the `wanted` one, or one that depends on the number of photographs.
 pub(super) fn max_features(wanted: Option<usize>, photos: usize) -> usize {
     let many = MANY_FEATURES.into_iter().find(|(most, _)| photos <= *most);
     let usual = many.map_or(Sift::default().max_features, |(_, features)| features);
     wanted.unwrap_or(usual)
 }
 
-/// The photographs on their way to matches.
+/// The photographs with the features and matches found so far.
 pub(super) struct Work<'a> {
     folder: &'a PhotoFolder,
     progress: &'a (dyn Fn(PoseProgress) + Sync),
-    /// Where features and matches are kept, if they are.
+    /// The file in which features and matches are kept, if any.
     path: Option<PathBuf>,
     settings: Settings,
     sift: Sift,
     known: Known,
     /// Indices of the folder's photographs that could be decoded.
     used: Vec<usize>,
-    /// Of their files.
+    /// Hashes of their files.
     hashes: Vec<u64>,
     features: Vec<Features>,
     colors: Vec<Vec<[u8; 3]>>,
     appearances: Vec<Appearance>,
-    /// Names of the others, and why.
+    /// Names of the photographs that could not be decoded, and why.
     undecodable: Vec<(String, String)>,
     warnings: Vec<String>,
 }
 
 impl<'a> Work<'a> {
-    /// Features and matches are kept in the folder `out`.
+    /// Features and matches are kept in the folder `out`, if there is one.
     pub fn new(
         wanted: Option<usize>,
         out: Option<&Path>,
@@ -72,8 +72,9 @@ impl<'a> Work<'a> {
         Self::with(sift, out.map(|out| out.join(STORE)), folder, progress)
     }
 
-    /// The same photographs for a second attempt: with frontal descriptors and, unless their number was wanted or a fifth of them at most are `left_out`, with twice
-    /// the features if half of those or more have as many as were allowed. Twice as many take four times as long to match.
+    /// The same photographs for a second attempt: with frontal descriptors, and with twice the features if at least half of the photographs
+    /// that were `left_out` have the maximum number. The number stays if it was `wanted`, or if some but at most a fifth of the photographs
+    /// were left out, since twice as many features take four times as long to match.
     pub fn again(&self, wanted: Option<usize>, left_out: &[usize], out: &Path) -> Self {
         let most = self.sift.max_features;
         let full = left_out
@@ -140,12 +141,12 @@ impl<'a> Work<'a> {
         work
     }
 
-    /// How features are found.
+    /// The settings of feature extraction.
     pub fn sift(&self) -> &Sift {
         &self.sift
     }
 
-    /// Tells the user now, and the report at the end.
+    /// Shows a warning to the user now, and keeps it for the report.
     pub fn warn(&mut self, warning: Option<String>) {
         if let Some(warning) = warning {
             (self.progress)(PoseProgress::Warned(warning.clone()));
@@ -153,7 +154,7 @@ impl<'a> Work<'a> {
         }
     }
 
-    /// Indices of the folder's photographs that have features, which is the order of everything below.
+    /// Indices of the folder's photographs that have features; features, colours and appearances are in this order.
     pub fn photos(&self) -> &[usize] {
         &self.used
     }
@@ -167,7 +168,7 @@ impl<'a> Work<'a> {
         &self.colors
     }
 
-    /// The figures of each photograph's pixels.
+    /// The pixel statistics of each photograph.
     pub fn appearances(&self) -> &[Appearance] {
         &self.appearances
     }
@@ -180,7 +181,7 @@ impl<'a> Work<'a> {
         &self.warnings
     }
 
-    /// Features of all photographs, those that are not known yet in parallel.
+    /// Finds the features of all photographs; those that are not known yet are extracted in parallel.
     pub fn find_features(&mut self) -> Result<(), RunError> {
         let photos = &self.folder.photos;
         (self.progress)(PoseProgress::Stage {
@@ -219,7 +220,7 @@ impl<'a> Work<'a> {
                 Err(reason) => self.undecodable.push((photo.name.clone(), reason)),
             }
         }
-        // Photographs that are gone are forgotten.
+        // Discards photographs that no longer exist.
         self.known.looks = Default::default();
         let kept: HashSet<u64> = self.hashes.iter().copied().collect();
         self.known
@@ -242,12 +243,12 @@ impl<'a> Work<'a> {
         Ok(store::write(path, self.settings, photos, &self.known.matches)?)
     }
 
-    /// Matches of the pairs worth it.
+    /// Matches the pairs that are worth matching.
     pub fn match_pairs(&mut self, options: &PairOptions) -> Result<Vec<PairMatches>, RunError> {
         self.matches_of(candidate_pairs(&self.features, options, &MatchOptions::default()))
     }
 
-    /// Matches of `pairs`, those that are not known yet in parallel.
+    /// The matches of `pairs`; those that are not known yet are computed in parallel.
     pub fn matches_of(&mut self, pairs: Vec<[u32; 2]>) -> Result<Vec<PairMatches>, RunError> {
         let matching = MatchOptions::default();
         let hash = |pair: &[u32; 2]| pair.map(|i| self.hashes[i as usize]);
@@ -273,7 +274,7 @@ impl<'a> Work<'a> {
                 .map(|pair| (hash(&pair.photos), pair.matches))
                 .collect();
             self.known.matches.extend(found);
-            // Of a long stage little is lost if it is interrupted.
+            // If a long stage is interrupted, little is lost.
             if saved.elapsed() > SAVED_EVERY {
                 self.save()?;
                 saved = Instant::now();
@@ -290,7 +291,7 @@ impl<'a> Work<'a> {
     }
 }
 
-/// Features of a photograph, in its pixels at full size, and the colours there.
+/// Extracts the features of a photograph, in pixels at full size, with their colours and the photograph's pixel statistics.
 fn extract(sift: &Sift, photo: &PhotoEntry) -> Result<Looks, String> {
     let pixels = photo.read(sift.max_side).map_err(|error| error.to_string())?;
     let grey = in_grey(&pixels.data, pixels.channels);
@@ -316,7 +317,7 @@ fn extract(sift: &Sift, photo: &PhotoEntry) -> Result<Looks, String> {
     })
 }
 
-/// What counts of a photograph: its alpha, and its mask where it has one.
+/// The combined mask of a photograph: its alpha and its mask file, if it has them.
 fn mask_of(photo: &PhotoEntry, pixels: &Pixels) -> Result<Option<Vec<u8>>, String> {
     let given = photo
         .read_mask(pixels.width, pixels.height)
@@ -325,7 +326,7 @@ fn mask_of(photo: &PhotoEntry, pixels: &Pixels) -> Result<Option<Vec<u8>>, Strin
     Ok(both(given, alpha))
 }
 
-/// The mask of what neither a mask nor alpha hides.
+/// Combines a mask and an alpha channel: a pixel is kept if neither hides it.
 pub(super) fn both(mask: Option<Vec<u8>>, alpha: Option<Vec<u8>>) -> Option<Vec<u8>> {
     match (mask, alpha) {
         (Some(mask), Some(alpha)) => Some(mask.into_iter().zip(alpha).map(|(a, b)| a.min(b)).collect()),
@@ -333,7 +334,7 @@ pub(super) fn both(mask: Option<Vec<u8>>, alpha: Option<Vec<u8>>) -> Option<Vec<
     }
 }
 
-/// `[to[1], to[0], 3]` the pixels reduced to that size.
+/// `[to[1], to[0], 3]` the pixels reduced to the size `to`.
 pub(super) fn in_rgb(pixels: &Pixels, to: [u32; 2]) -> Vec<u8> {
     let reduced = resize_area(&pixels.data, pixels.channels, [pixels.width, pixels.height], to);
     let channels = pixels.channels as usize;

@@ -1,5 +1,5 @@
-//! Masks of what stands still in the pictures while the rest moves: poses and splats are those of the rest. What has texture is found by matches that stand still,
-//! before the poses; the plain backdrop of a turntable by the poses.
+//! Masks of what stands still in the photographs while the rest moves: poses and splats are those of the rest. Textured parts are found by
+//! matches that stand still, before the poses; the plain backdrop of a turntable is found by the poses.
 
 use super::PoseProgress;
 use super::attempt::{Attempt, Matched};
@@ -15,53 +15,54 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// What tells that masks are of an earlier call, in their folder.
+/// File in the folder of masks that marks them as written by an earlier call.
 const RECORD: &str = ".irradia";
-/// Longer side of the pictures in which masks are found, px.
+/// Longer side of the reduced photographs in which masks are found, px.
 const SIDE: u32 = 480;
-/// Photographs of one camera from which on what is behind can be told.
+/// Minimum number of photographs of one camera to determine a still background.
 const LEAST: usize = 4;
-/// A photograph shows what is behind others if it has this part of what they show of it in the mean.
+/// A photograph shows a still background if it shows at least this fraction of the mean share that photographs show of it.
 const SHOWS: f64 = 0.5;
-/// Least part of the pixels that moves: photographs of one place are no turntable.
+/// Minimum fraction of the pixels that moves: photographs from one place are not of a turntable.
 const MOVES: f64 = 0.03;
-/// A backdrop surrounds what turns: it is more than this part of the border of half of the pictures. A camera that circles exactly, such as that of a drone, has the plain sky in the
-/// upper half at most.
+/// A backdrop surrounds what turns: it takes at least this fraction of the border of half of the photographs. A camera that flies an exact
+/// circle, such as a drone's, has plain sky in the upper half at most.
 const SURROUNDS: f64 = 0.55;
-/// The part of the pictures that a backdrop is, at least: where masks keep less than half, training leaves nothing beside what they keep. A medal before a dark backdrop, 29 % of
-/// which can be masked, gains nothing by it.
+/// Minimum fraction of the photographs' pixels that a backdrop takes: if masks keep less than half, training leaves no splats outside of
+/// what they keep. A medal in front of a dark backdrop, 29 % of which can be masked, gains nothing from masks.
 const COVERS: f64 = 0.5;
-/// Rings, the largest, whose backdrops each photograph is compared with, for the time it takes.
+/// Number of rings, the largest ones, whose backdrops each photograph is compared with; limits the time.
 const RINGS: usize = 8;
-/// Photographs of each camera that are searched for bars and writing.
+/// Number of photographs of each camera that are examined for bars and text.
 const EXAMINED: usize = 24;
-/// The part of the pictures that writing lies over, at most. More may be behind the scene, such as the background of a turntable, and hidden by it in some: of a tankard
-/// that has 86 % of the pictures, 7 % would be masked with it.
+/// Maximum fraction of the pixels that overlaid text covers. A larger still part may be behind the scene, such as the background of a
+/// turntable, and hidden by the scene in some photographs: 7 % of a tankard that fills 86 % of its photographs would be masked with it.
 const LIES_OVER: f64 = 0.06;
-/// How far the colour of a backdrop must range in half of the pictures, of 255: one colour is the same wherever it is, and no harm.
+/// Minimum range of a backdrop's colour in half of the photographs, of 255: a backdrop of a single colour looks the same from everywhere
+/// and does no harm.
 const RANGE: f64 = 8.0;
 
-/// Small pictures, `[H, W, 3]`, by photograph.
+/// Reduced photographs, `[H, W, 3]`, by index of the photograph.
 type Pictures = BTreeMap<usize, Vec<u8>>;
 
-/// What was masked.
+/// The result of masking what stands still.
 pub(super) struct Masked {
     /// The photographs with their masks.
     pub folder: PhotoFolder,
     pub still: StandsStill,
-    /// For the user.
+    /// Message for the user.
     pub told: String,
 }
 
-/// What stands still behind some photographs.
+/// A still background behind some photographs.
 struct Behind {
     scene: StillScene,
-    /// The part of a picture that shows it, at least.
+    /// Minimum fraction of a photograph that shows it.
     least: f64,
 }
 
 impl Behind {
-    /// From those of `pictures` that are of `group`, if there are enough.
+    /// The background behind those of `pictures` that are in `group`, if there are enough.
     fn of(group: &[usize], [width, height]: [u32; 2], pictures: &Pictures) -> Option<Self> {
         let of: Vec<&Vec<u8>> = group.iter().filter_map(|photo| pictures.get(photo)).collect();
         (of.len() >= LEAST).then(|| {
@@ -78,13 +79,13 @@ impl Behind {
     }
 }
 
-/// Pixels, row by row: where something stands still.
+/// A mask of what stands still, row by row.
 struct Mask {
     size: [u32; 2],
     still: Vec<bool>,
 }
 
-/// Writes masks into `out`, if a part of the pictures stands still and no photograph has a mask of its own.
+/// Writes masks into `out` if a part of the photographs stands still and no photograph has a mask of its own.
 pub(super) fn mask(
     matched: &Matched,
     folder: &PhotoFolder,
@@ -105,7 +106,7 @@ pub(super) fn mask(
         out,
         folder,
         &masks,
-        "stand still while the rest moves (the background of a turntable, or what carries the camera)",
+        "stand still while the rest moves (the background of a turntable, or whatever carries the camera)",
         progress,
     )?;
     let with_mask = |photo: &PhotoEntry| photo.with_mask(written.join(file_name(photo)));
@@ -120,8 +121,8 @@ pub(super) fn mask(
     }))
 }
 
-/// Writes masks of the backdrop into `out`, if the poses are those of a turntable before a plain one and no photograph has a mask of its own; what the user should know.
-/// The poses are right without.
+/// Writes masks of the backdrop into `out` if the poses are those of a turntable in front of a plain backdrop and no photograph has a mask
+/// of its own; returns the message for the user. The poses do not need these masks.
 pub(super) fn mask_backdrop(
     attempt: &Attempt,
     folder: &PhotoFolder,
@@ -140,8 +141,9 @@ pub(super) fn mask_backdrop(
     Ok(Some(told))
 }
 
-/// Writes masks of bars around the pictures and of writing over them into `out`, if there are such and no photograph has a mask of its own; what the user should know. Poses are right
-/// without, since bars show nothing and writing little, but splats would be hung before the cameras for them.
+/// Writes masks of bars around the photographs and of overlaid text into `out` if there are any and no photograph has a mask of its own;
+/// returns the message for the user. The poses do not need these masks, since bars have no features and text few, but training would place
+/// splats directly in front of the cameras to reproduce them.
 pub(super) fn mask_edited(
     attempt: &Attempt,
     folder: &PhotoFolder,
@@ -177,17 +179,17 @@ pub(super) fn mask_edited(
         out,
         folder,
         &masks,
-        "are bars around the pictures or writing over them",
+        "are bars around the image or text laid over it",
         progress,
     )?;
     Ok(Some(told))
 }
 
-/// Where `pictures` have bars around them, the same in all; `None` if they have none.
+/// The pixels of bars around `pictures`, the same in all; `None` if there are no bars.
 fn bars_in(size: [u32; 2], pictures: &Pictures) -> Option<Vec<bool>> {
     let [width, height] = size.map(|side| side as usize);
     let bars = bars(width, height, &pictures.values().collect::<Vec<_>>());
-    // The lines at the edge are of both.
+    // Lines at the edge of a bar are a mixture of bar and photograph.
     let [left, above, right, below] = bars.map(|bar| if bar > 0 { bar + 2 } else { 0 });
     let is_bar = |at: usize| {
         let (x, y) = (at % width, at / width);
@@ -196,19 +198,20 @@ fn bars_in(size: [u32; 2], pictures: &Pictures) -> Option<Vec<bool>> {
     (bars != [0; 4]).then(|| (0..width * height).map(is_bar).collect())
 }
 
-/// What may lie over `pictures`.
+/// Candidates for what is overlaid on all of `pictures`.
 fn overlay([width, height]: [u32; 2], pictures: &Pictures) -> Overlay<'_> {
     Overlay::of(width as usize, height as usize, &pictures.values().collect::<Vec<_>>())
 }
 
-/// What lies over `pictures`, if that is sure and little.
+/// The pixels of what is overlaid on `pictures`, if it is certain and small.
 fn writing_over(size: [u32; 2], pictures: &Pictures) -> Option<Vec<bool>> {
     let overlay = overlay(size, pictures);
     let lies = overlay.is_sure().then(|| overlay.pixels())?;
     (share(&lies) as f64 <= LIES_OVER * lies.len() as f64).then_some(lies)
 }
 
-/// Takes masks that an earlier call wrote into `out` from `photos`, which lie there themselves: they are not the user's.
+/// Removes from `photos` the masks that an earlier call wrote into `out`, which is also the folder of the photographs: they are not the
+/// user's.
 pub(super) fn ignore_own(photos: &mut [PhotoEntry], out: &Path) -> Result<(), RunError> {
     let written = out.join(MASKS);
     if !written.join(RECORD).exists() {
@@ -223,7 +226,7 @@ pub(super) fn ignore_own(photos: &mut [PhotoEntry], out: &Path) -> Result<(), Ru
     Ok(())
 }
 
-/// Whether there are no masks, once those of an earlier call are put away: somebody may have edited them.
+/// Puts away the masks of an earlier call, which the user may have edited; returns whether there are no other masks.
 fn is_free_once_cleared(folder: &PhotoFolder, out: &Path) -> Result<bool, RunError> {
     let written = out.join(MASKS);
     let record = written.join(RECORD);
@@ -236,11 +239,11 @@ fn is_free_once_cleared(folder: &PhotoFolder, out: &Path) -> Result<bool, RunErr
         fs::remove_file(&record).map_err(RunError::io("remove", &record))?;
         put_away(out, names.into_iter().map(|name| format!("{MASKS}/{name}")))?;
     }
-    // Somebody's, for the poses or for the training alone.
+    // Any remaining masks are the user's, for the poses or for the training alone.
     Ok(!written.exists() && folder.photos.iter().all(|photo| photo.mask.is_none()))
 }
 
-/// Writes masks of `what` some photographs show; their folder, and what the user was told.
+/// Writes masks and tells the user of `what` they are; returns their folder and that message.
 fn write_and_tell(
     out: &Path,
     folder: &PhotoFolder,
@@ -252,7 +255,8 @@ fn write_and_tell(
     let masked: usize = (masks.values()).map(|mask| share(&mask.still)).sum();
     let of: usize = masks.values().map(|mask| mask.still.len()).sum();
     let told = format!(
-        "{:.0} % of {} photographs {what}: masked in {}; give masks of your own, in a folder masks beside the photographs, to decide otherwise",
+        "{:.0} % of the pixels of {} photographs {what}: masked in {}; to change this, put masks of your own into a folder named masks \
+         beside the photographs",
         100.0 * masked as f64 / of as f64,
         masks.len(),
         written.display()
@@ -275,7 +279,7 @@ fn find(matched: &Matched, folder: &PhotoFolder, still: &StandsStill) -> Result<
     })
 }
 
-/// Adds what lies over all of `pictures` to the masks of each: unlike what is behind, it is hidden in none.
+/// Adds what is overlaid on all of `pictures` to the mask of each: unlike a background, it is hidden in none of them.
 fn add_overlay(size: [u32; 2], pictures: &Pictures, masks: &mut BTreeMap<usize, Vec<bool>>) {
     let mut lies = overlay(size, pictures).pixels();
     for (at, lies) in lies.iter_mut().enumerate() {
@@ -291,14 +295,14 @@ fn add_overlay(size: [u32; 2], pictures: &Pictures, masks: &mut BTreeMap<usize, 
     }
 }
 
-/// As [`find`], of a plain backdrop behind what turns in `rings`.
+/// Like [`find`], for a plain backdrop behind what turns in `rings`.
 fn behind_turntable(
     matched: &Matched,
     folder: &PhotoFolder,
     rings: &[Vec<usize>],
 ) -> Result<BTreeMap<usize, Mask>, RunError> {
     of_cameras(matched, folder, |[width, height], pictures| {
-        // A photograph in other light, such as with the shadow of what turns, may show more of that behind another ring.
+        // A photograph in different light, such as with the shadow of what turns, may match the backdrop of another ring better.
         let backdrops: Vec<Backdrop> = rings
             .iter()
             .take(RINGS)
@@ -329,12 +333,12 @@ fn behind_turntable(
     })
 }
 
-/// Pixels of a mask where something stands still.
+/// Number of pixels of a mask where something stands still.
 fn share(mask: &[bool]) -> usize {
     mask.iter().filter(|still| **still).count()
 }
 
-/// Masks by index of the folder's photographs, from those that `of` finds in the small pictures, `[H, W, 3]`, of each camera.
+/// Masks by index of the folder's photographs; `of` finds them in the reduced photographs, `[H, W, 3]`, of each camera.
 fn of_cameras(
     matched: &Matched,
     folder: &PhotoFolder,
@@ -359,7 +363,7 @@ fn cameras(matched: &Matched) -> Vec<Vec<usize>> {
     cameras.into_values().collect()
 }
 
-/// The pictures of `photos` of one camera, and their size.
+/// Reduced copies of `photos`, which are by one camera, and their size.
 fn pictures(matched: &Matched, folder: &PhotoFolder, photos: &[usize]) -> Result<([u32; 2], Pictures), RunError> {
     let entry = |photo: usize| &folder.photos[matched.work.photos()[photo]];
     let size = small(entry(photos[0]));
@@ -370,7 +374,8 @@ fn pictures(matched: &Matched, folder: &PhotoFolder, photos: &[usize]) -> Result
     Ok((size, pictures))
 }
 
-/// Where `pictures` show what is behind them, by photograph. Of several `scenes`, such as those of rings of different height, each shows the one it has most of.
+/// The pixels at which `pictures` show a background, by photograph. Of several `scenes`, such as those of rings at different heights, each
+/// photograph gets the one of which it shows most.
 fn shown(scenes: &[Behind], pictures: &Pictures) -> BTreeMap<usize, Vec<bool>> {
     let most = |picture: &[u8]| {
         let all = scenes.iter().enumerate().map(|(i, behind)| {
@@ -395,7 +400,7 @@ fn shown(scenes: &[Behind], pictures: &Pictures) -> BTreeMap<usize, Vec<bool>> {
     by_scene.into_values().filter(moves).flatten().collect()
 }
 
-/// The size of the picture in which the mask of `photo` is found, the same for all of its camera.
+/// The reduced size at which the mask of `photo` is found, the same for all photographs of its camera.
 fn small(photo: &PhotoEntry) -> [u32; 2] {
     let size = [photo.width, photo.height];
     let scale = (f64::from(SIDE) / f64::from(photo.width.max(photo.height))).min(1.0);
@@ -406,7 +411,7 @@ fn file_name(photo: &PhotoEntry) -> String {
     format!("{}.png", photo.name)
 }
 
-/// One mask for each photograph, at its size, in a folder of `out`: white where nothing is known to stand still.
+/// Writes one mask per photograph, at its size, into a subfolder of `out`: white where nothing is known to stand still.
 fn write(out: &Path, of: &PhotoFolder, masks: &BTreeMap<usize, Mask>) -> Result<PathBuf, RunError> {
     let folder = out.join(MASKS);
     let new = folder.with_extension("new");
@@ -432,7 +437,7 @@ impl Mask {
     /// The mask at `size`, black where something stands still, with smooth edges.
     fn enlarged(&self, [width, height]: [u32; 2]) -> Vec<u8> {
         let [w, h] = self.size.map(|side| side as usize);
-        // Where the centre of a pixel lies between two others, and how far from the first.
+        // The two pixels of the mask between whose centres the centre of this pixel is, and the distance from the first.
         let between = |at: u32, of: u32, side: usize| {
             let at = ((at as f32 + 0.5) * side as f32 / of as f32 - 0.5).clamp(0.0, (side - 1) as f32);
             (at as usize, (at as usize + 1).min(side - 1), at.fract())

@@ -1,8 +1,8 @@
-//! Features and matches on disk, by the hash of the photographs' bytes: renamed photographs keep theirs, changed ones lose them.
+//! Features and matches on disk, keyed by the hash of the photographs' bytes: renamed photographs keep theirs, changed ones lose them.
 //!
-//! Little-endian: the signature; the settings; u64 photographs, each u64 hash, five `f32` of its appearance, u64 features, each
-//! `f32 x, y, scale, angle`, the descriptor, the frontal one if there are such, and `r, g, b`; u64 pairs, each the hashes of both photographs, u64 matches,
-//! each `u32, u32`.
+//! Little-endian: the signature; the settings; u64 number of photographs, each with u64 hash, five `f32` of its appearance, u64 number of
+//! features, each with `f32 x, y, scale, angle`, the descriptor, the frontal descriptor if there are any, and `r, g, b`; u64 number of
+//! pairs, each with the hashes of both photographs, u64 number of matches, each `u32, u32`.
 
 use irradia_formats::{FormatError, write_atomic};
 use irradia_sfm::doctor::Appearance;
@@ -11,9 +11,9 @@ use std::collections::HashMap;
 use std::io::{self, Write};
 use std::path::Path;
 
-/// Ends in the version of everything that features and matches depend on beside the settings.
+/// Ends in the version of everything besides the settings on which features and matches depend.
 const SIGNATURE: &[u8; 16] = b"irradia.sfm 0004";
-/// What features depend on: settings of their extractor, and whether they have frontal descriptors.
+/// What features depend on: the settings of their extractor, and whether they have frontal descriptors.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Settings {
     pub extractor: [u32; 4],
@@ -27,13 +27,13 @@ impl Settings {
         SIGNATURE.iter().copied().chain(settings).collect()
     }
 
-    /// Bytes of a feature.
+    /// Size of a feature, bytes.
     fn feature(self) -> usize {
         16 + DESCRIPTOR_BYTES * (1 + usize::from(self.frontal)) + 3
     }
 }
 
-/// The features of a photograph, the colours there, and figures of its pixels.
+/// The features of a photograph, their colours, and statistics of its pixels.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Looks {
     /// In pixels at full size.
@@ -43,7 +43,7 @@ pub(super) struct Looks {
     pub appearance: Appearance,
 }
 
-/// What is known from an earlier call.
+/// The results of an earlier call.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Known {
     /// By the photograph's hash.
@@ -52,7 +52,7 @@ pub(super) struct Known {
     pub matches: HashMap<[u64; 2], Vec<[u32; 2]>>,
 }
 
-/// The content of the file at `path` if it was written under the same `settings`, else nothing; a warning if it is damaged.
+/// The content of the file at `path` if it was written with the same `settings`, otherwise nothing; and a warning if it is damaged.
 pub(super) fn read(path: &Path, settings: Settings) -> (Known, Option<String>) {
     let Ok(bytes) = std::fs::read(path) else {
         return Default::default();
@@ -64,12 +64,12 @@ pub(super) fn read(path: &Path, settings: Settings) -> (Known, Option<String>) {
         Some(known) => (known, None),
         None => (
             Known::default(),
-            Some(format!("{} is damaged; features are found again", path.display())),
+            Some(format!("{} is damaged; features are extracted again", path.display())),
         ),
     }
 }
 
-/// Photographs by their hashes, with their features, the colours of these, and the figures of their pixels.
+/// Hashes of photographs, their features, the colours of these, and their pixel statistics.
 pub(super) type Photos<'a> = (&'a [u64], &'a [Features], &'a [Vec<[u8; 3]>], &'a [Appearance]);
 
 /// Writes photographs and the matches between them.

@@ -1,4 +1,4 @@
-//! Scenes made small.
+//! Compaction of scenes.
 
 use crate::folder;
 use irradia_runs::formats::read_splats;
@@ -54,14 +54,14 @@ fn a_scene_gets_as_small_as_it_is_asked_to_and_its_pictures_stay() {
         "the same bytes"
     );
 
-    // What a file has beside its splats is more than half of so small a scene.
+    // In a scene this small, more than half of the file does not depend on the number of splats.
     let most = half.bytes[1] * 7 / 8;
     let small = compact(&input(Some(CompactTarget::Bytes(most)), "small.sog"), &mut |_| ()).expect("compacted");
     assert!(small.bytes[1] <= most && small.bytes[1] > most * 3 / 4, "{small:?}");
     let other = compact(&input(Some(CompactTarget::Splats(count)), "all.spz"), &mut |_| ()).expect("compacted");
     assert_eq!(other.splats, [count, count]);
 
-    // Any loss is allowed: the smallest that is tried.
+    // Any loss is allowed: the result is the smallest scene that is tried.
     let searched = CompactInput {
         keep_psnr: Some(100.0),
         steps: 10,
@@ -69,7 +69,7 @@ fn a_scene_gets_as_small_as_it_is_asked_to_and_its_pictures_stay() {
     };
     let least = compact(&searched, &mut |_| ()).expect("compacted");
     assert!(least.splats[1] < count / 10, "{least:?}");
-    // None is: all splats stay, and it says so.
+    // No loss is allowed: more splats are kept, and a note says so.
     let strict = CompactInput {
         keep_psnr: Some(0.0),
         steps: 10,

@@ -1,4 +1,4 @@
-//! Edited scenes on disk, and trainings that begin with them.
+//! Edited scenes on disk, and runs that begin with them.
 
 use crate::{begin, dataset, folder, input};
 use glam::{Quat, Vec3};
@@ -38,7 +38,7 @@ fn a_folder_gets_the_scene_its_moved_cameras_and_the_edits() {
     let editing = edited(&path, &["rotate axis=1,2,0 degrees=40", "move by=0,0,3"]);
     editing.write(&out, &WriteOptions::default()).expect("writes");
 
-    // The scene and its cameras have moved alike.
+    // The scene and its cameras have moved together.
     let (before, after) = (Scene::read(&path).expect("a run"), Scene::read(&out).expect("a folder"));
     let cameras = |scene: &Scene| scene.cameras.clone().expect("beside it");
     for (old, new) in cameras(&before).iter().zip(cameras(&after).iter()) {
@@ -54,14 +54,14 @@ fn a_folder_gets_the_scene_its_moved_cameras_and_the_edits() {
     let written = EditList::parse(&fs::read_to_string(out.join(EDITS)).expect("a list")).expect("valid");
     assert_eq!(&written, editing.list());
 
-    // Replayed on the same scene: the same bytes, in any format's file.
+    // Replayed on the same scene, the list gives the same bytes.
     let again = folder.path().join("again.ply");
     let mut replayed = Editing::open(&path).expect("a scene");
     replayed.apply(&written).expect("the same edits");
     replayed.write(&again, &WriteOptions::default()).expect("writes");
     assert!(fs::read(&again).unwrap() == fs::read(out.join("scene.ply")).unwrap());
 
-    // What must not be overwritten is not.
+    // Outputs that must not be overwritten are rejected.
     for (out, words) in [
         (path.join("scene.ply"), "would be replaced"),
         (path.clone(), "would be replaced"),
@@ -76,7 +76,7 @@ fn a_folder_gets_the_scene_its_moved_cameras_and_the_edits() {
     let error = editing.write_in_place().expect_err("moved").to_string();
     assert!(error.contains("photographs"), "{error}");
 
-    // Another scene in the same folder gets nothing of this one.
+    // Another scene written to the same folder keeps no files of this one.
     edited(&again, &["opacity factor=0.9 all"])
         .write(&out, &WriteOptions::default())
         .expect("writes");
@@ -98,7 +98,7 @@ fn what_is_split_off_and_merged_again_is_the_same_scene() {
         part.is_file() && notes.iter().any(|note| note.contains("split off")),
         "{notes:?}"
     );
-    // In a folder that is not there yet; neither the scene's name nor one name twice.
+    // A folder that does not exist yet is created; the scene's own name and duplicate names are rejected.
     let fresh = folder.path().join("fresh");
     editing.write(&fresh, &WriteOptions::default()).expect("writes");
     assert!(fresh.join("part.ply").is_file() && fresh.join("scene.ply").is_file());
@@ -158,11 +158,11 @@ fn a_run_edited_in_place_resumes_with_the_edited_splats() {
     assert!(notes.iter().any(|note| note.contains("optimiser state")), "{notes:?}");
     let left = read_splats(&path.join("scene.ply")).unwrap().len();
     assert!(left < before && left == editing.draft().len());
-    // A second edit is listed behind the first.
+    // A second edit is appended to the list.
     edited(&path, &["opacity factor=0.9 all"])
         .write_in_place()
         .expect("writes");
-    // What was split off is nowhere else.
+    // The file of a split is the only copy of its splats, so it is not overwritten.
     let split = |half: &str| edited(&path, &[&format!("split name=part {half}")]).write_in_place();
     split("half-space point=0,0,0.3 normal=0,0,1").expect("writes");
     let part = fs::read(path.join("part.ply")).expect("was split off");
@@ -239,7 +239,7 @@ fn a_training_begins_with_the_splats_of_a_scene() {
     assert!(!folder.path().join("other").exists());
 }
 
-/// Five hundred floaters of five kinds in a trained scene: nearly all go, the scene stays, and held-out views recover.
+/// Five hundred floaters of five kinds in a trained scene: nearly all are removed, the scene stays, and held-out views recover.
 #[test]
 fn floaters_planted_in_a_trained_scene_are_removed() {
     let folder = folder();
@@ -292,14 +292,15 @@ fn floaters_planted_in_a_trained_scene_are_removed() {
         "the report's own figure: {before}, {as_trained}"
     );
     assert!(with < as_trained - 3.0, "{with}");
-    // The walls of this brief training are too sparse to show every floater to be in front of them; what stays costs the rest.
+    // After this short training, the walls are too sparse to show that every floater is in front of them; the remaining floaters cost the
+    // rest.
     assert!(
         after > with + 5.0,
         "{after:.2} dB, {with:.2} dB with floaters, {as_trained:.2} dB as trained"
     );
 }
 
-/// A hundred each: isolated in front of a surface, needles, huge, outside of all views, close to a camera.
+/// Adds a hundred floaters of each kind: isolated in front of a surface, needles, huge, outside all views, close to a camera.
 fn planted(clean: &GaussianCloud, cameras: &[Camera]) -> GaussianCloud {
     let mut cloud = clean.clone();
     let mut rng = Rng::new(5, 0);

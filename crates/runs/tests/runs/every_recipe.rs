@@ -1,4 +1,4 @@
-//! Every built-in recipe on every posed folder of `../shared/data`, shrunk to 120 pixels and kept in memory.
+//! Every built-in recipe on every posed folder of `../shared/data`, downscaled to 120 pixels and kept in memory.
 
 use irradia_field::Sampler;
 use irradia_runs::formats::{DatasetOptions, read_dataset};

@@ -1,4 +1,4 @@
-//! Runs on a GPU, beside the same on the CPU.
+//! Runs on a GPU, compared with the same runs on the CPU.
 
 use super::*;
 use irradia_compute::gpu::{Gpu, Wanted};
@@ -28,7 +28,7 @@ fn a_run_on_the_gpu_ends_as_on_the_cpu() {
             let mut run = on(device, folder.path(), recipe, 30);
             run.train(&mut []).expect("trains");
             let report = run.finish().expect("finishes").report;
-            // Its losses of smoothness and of coarse images are the CPU's, and the report says so.
+            // The smoothness and coarse losses of `curriculum` are computed on the CPU, and the report says so.
             let told = report
                 .warnings
                 .iter()
@@ -37,7 +37,7 @@ fn a_run_on_the_gpu_ends_as_on_the_cpu() {
             assert_eq!(report.device.contains("GPU"), device == "gpu", "{}", report.device);
             report.psnr
         });
-        // mcmc draws other random numbers on the GPU; 30 steps amplify little.
+        // mcmc draws different random numbers on the GPU; 30 steps amplify the difference little.
         let most = if recipe == "mcmc" { 0.3 } else { 0.1 };
         assert!((psnr[0] - psnr[1]).abs() < most, "{recipe}: {psnr:?}");
     }

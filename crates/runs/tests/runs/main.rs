@@ -1,4 +1,4 @@
-//! The library as a program uses it: requests, runs, observers, and scenes.
+//! The library's public API as a program uses it: requests, runs, observers, and scenes.
 
 mod compact;
 mod edits;

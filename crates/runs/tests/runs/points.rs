@@ -1,4 +1,4 @@
-//! Points of datasets that have poses and none.
+//! Points for datasets that have poses but no points.
 
 use crate::pose::{OPTIONS, views_of};
 use crate::{folder, input};
@@ -20,10 +20,10 @@ fn without_points() -> Dataset {
     }
 }
 
-/// The largest relative error of depth of a sound point; the scene has a mirror, whose points lie behind it.
+/// Maximum relative depth error of a sound point; the scene has a mirror, whose points are behind it.
 const SOUND: f32 = 0.05;
 
-/// `[points seen]` the relative error of depth of each point in each view that is said to show it.
+/// `[points seen]` the relative depth error of each point in each view that is recorded as showing it.
 fn errors_of_depth(dataset: &Dataset, points: &PointCloud) -> Vec<f32> {
     let scene = OPTIONS.scene.build(OPTIONS.seed).0;
     let mut errors = Vec::new();
@@ -32,7 +32,7 @@ fn errors_of_depth(dataset: &Dataset, points: &PointCloud) -> Vec<f32> {
         for point in &view.points_seen {
             let seen = view.camera.sees(points.positions[*point as usize]);
             let (at, z) = seen.expect("within the image");
-            // A corner may be on the other side of an edge by a pixel.
+            // A feature at a corner may be on the other side of an edge by a pixel.
             let near = |v: f32, side: u32| (v as usize).saturating_sub(1)..(v as usize + 2).min(side as usize);
             let pixels = near(at.y, depth.height).flat_map(|y| near(at.x, depth.width).map(move |x| (x, y)));
             let error = |(x, y): (usize, usize)| (z / depth.data[y * depth.width as usize + x] - 1.0).abs();
@@ -42,7 +42,7 @@ fn errors_of_depth(dataset: &Dataset, points: &PointCloud) -> Vec<f32> {
     errors
 }
 
-/// A run of `steps` steps that began, and what was told of the points.
+/// A run after its first two steps, and its messages about points.
 fn begun(input: TrainInput, dataset: Dataset) -> (Run, Vec<String>) {
     struct Told(Vec<String>);
     impl Observer for Told {

@@ -1,4 +1,4 @@
-//! Photographs in, a dataset out: ray-traced photographs whose poses are known, and folders with which nothing can be done.
+//! Photographs in, a dataset out: ray-traced photographs with known poses, and folders that cannot be posed.
 
 use glam::{Quat, Vec3};
 use irradia_runs::formats::{DatasetFormat, DatasetOptions, Lenses, read_dataset, read_image, write_png};
@@ -35,7 +35,7 @@ pub(crate) fn photographs(folder: &Path) -> Vec<(String, Camera)> {
         .enumerate()
         .map(|(i, shot)| {
             let name = format!("{i:02}.png");
-            // A quarter of the usual samples: features do not mind the noise.
+            // A quarter of the usual samples: features tolerate the noise.
             let frame = scene.trace(&shot.camera, 4, i as u64);
             write_png(&folder.join(&name), OPTIONS.width, OPTIONS.height, 4, &frame.rgba()).unwrap();
             (name, shot.camera)
@@ -43,7 +43,7 @@ pub(crate) fn photographs(folder: &Path) -> Vec<(String, Camera)> {
         .collect()
 }
 
-/// Degrees by which the turns between successive photographs of `dataset` differ from those of the truth, whatever the world is.
+/// Degrees by which the rotations between successive photographs of `dataset` differ from the true ones, independent of the world.
 fn turned_off(dataset: &Dataset, truth: &[(String, Camera)]) -> Vec<f32> {
     let of = |name: &str| {
         let (_, camera) = truth.iter().find(|(known, _)| name.ends_with(known.as_str())).unwrap();
@@ -61,7 +61,7 @@ pub(crate) fn quietly(input: &PoseInput) -> Result<PoseReport, RunError> {
     pose(input, &|_| {})
 }
 
-/// The training views of the cameras of [`OPTIONS`], of another `scene`.
+/// Training views by the cameras of [`OPTIONS`] of the given `scene`.
 pub(crate) fn views_of(scene: SceneName) -> Vec<View> {
     let capture = Capture::new(&OPTIONS).unwrap();
     let scene = scene.build(OPTIONS.seed).0;
@@ -182,7 +182,7 @@ fn ray_traced_photographs_get_their_poses_back_and_a_second_call_reuses_the_feat
             .any(|left| left.name == "broken.jpg" && left.reason.contains("not a readable"))
     );
     assert_eq!(report.registered + report.left_out.len(), report.photos);
-    // One search was enough.
+    // One attempt was enough.
     let [attempt] = &report.attempts[..] else {
         panic!("{:?}", report.attempts)
     };
@@ -198,7 +198,7 @@ fn ray_traced_photographs_get_their_poses_back_and_a_second_call_reuses_the_feat
 
     let before = fs::read(out.join("sparse/0/images.bin")).unwrap();
     let points = fs::read(out.join("sparse/0/points3D.bin")).unwrap();
-    // A thread and a second call change nothing.
+    // A second call, on a single thread, gives the same bytes.
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     let again = pool.install(|| pose(&input, &count)).unwrap();
     assert_eq!(matched.load(Ordering::Relaxed), 0, "matches are reused");
@@ -212,7 +212,7 @@ fn ray_traced_photographs_get_their_poses_back_and_a_second_call_reuses_the_feat
             .all(|stage| Duration::from_secs_f64(stage.seconds) < Duration::from_secs(600))
     );
 
-    // A known distance makes the unit a metre: here, two units of the truth.
+    // A known distance makes the unit a metre: here, a metre is two units of the truth.
     let place = |name: &str| {
         truth
             .iter()
@@ -320,17 +320,17 @@ fn folders_without_enough_photographs_have_one_clear_outcome() {
     refused(&two, &["2 readable photographs", "at least 3"]);
     let none = doctor(&DoctorInput::new(&two), &|_| {}).unwrap_err().to_string();
     assert!(none.contains("2 readable photographs"), "{none}");
-    // A dataset of another origin is not replaced.
+    // A dataset from another source is not replaced.
     let foreign = make("foreign");
     fs::create_dir(foreign.join("sparse")).unwrap();
     let error = quietly(&PoseInput::new(&apart, &foreign)).unwrap_err().to_string();
-    assert!(error.contains("another origin"), "{error}");
+    assert!(error.contains("another source"), "{error}");
     let film = folder.path().join("film.mp4");
     fs::write(&film, "no film").unwrap();
     refused(&film, &["film.mp4", "ffmpeg"]);
 }
 
-/// Noise has more features than are allowed and none that match; a smaller picture of it has few.
+/// Noise has more features than the maximum and none that match; a small image of noise has few.
 #[test]
 fn a_second_attempt_has_more_features_where_there_are_more_and_none_were_asked_for() {
     let folder = tempfile::tempdir().unwrap();
@@ -449,7 +449,7 @@ fn photographs_of_two_scenes_a_copy_and_a_text_file_have_one_clear_outcome() {
     );
     let page = fs::read_to_string(out.join("doctor.html")).unwrap();
     assert!(page.contains("separate-parts") && out.join("doctor/same.png.png").is_file());
-    // The doctor alone comes to the same, from the features that are there, and names the text file too.
+    // The doctor alone reports the same, from the existing features, and names the text file too.
     let alone = DoctorInput {
         out: Some(out.clone()),
         ..DoctorInput::new(&photos)
@@ -563,7 +563,7 @@ fn panoramas_in_folders_are_posed_by_their_faces() {
         let apart = found.angle_between(known).to_degrees();
         assert!(apart < 0.5, "{} and {}: {apart} degrees", pair[0].0, pair[1].0);
     }
-    // Faces are where their panorama is.
+    // All faces have the position of their panorama.
     let of = |side: &str| {
         let name = format!("00_{side}");
         let mut views = dataset.views.iter();
@@ -575,7 +575,7 @@ fn panoramas_in_folders_are_posed_by_their_faces() {
             .position
     };
     assert!(of("front").distance(of("up")) < 1e-5);
-    // Kept whole, panoramas stand for their faces.
+    // If panoramas are kept whole, they replace their faces.
     let options = DatasetOptions {
         lenses: Lenses::Whole,
         ..DatasetOptions::default()
@@ -592,7 +592,7 @@ fn panoramas_in_folders_are_posed_by_their_faces() {
             (view.photo.load().unwrap().width, view.camera.intrinsics.width),
             (768, 768)
         );
-        // Of a point that a face sees the direction is known: the panorama sees it as well.
+        // A point seen by a face is also seen by the panorama.
         assert!(view.points_seen.len() > 10);
         assert!(
             view.points_seen
@@ -600,7 +600,7 @@ fn panoramas_in_folders_are_posed_by_their_faces() {
                 .all(|i| view.camera.sees(points[*i as usize]).is_some())
         );
     }
-    // They are added to nothing.
+    // Panoramas cannot be added to a dataset.
     let into = PoseInput {
         into: true,
         ..PoseInput::new(&photos, &out)
@@ -616,7 +616,7 @@ fn colmap_is_driven_with_the_options_that_it_knows() {
     let at = |name: &str| folder.path().join(name);
     fs::create_dir(at("photos")).unwrap();
     photographs(&at("photos"));
-    // What it would have made.
+    // The models that the fake COLMAP copies.
     quietly(&PoseInput::new(at("photos"), at("ours"))).unwrap();
     let colmap = |option: &str| {
         let script = format!(
@@ -668,7 +668,7 @@ fn colmap_is_driven_with_the_options_that_it_knows() {
     );
 }
 
-/// As [`photographs`], as films: the first half of a ring, and the second, each frame shown for a while.
+/// The [`photographs`] as two films: the first half of a ring and the second, with each photograph shown for a while.
 fn films(folder: &Path) -> Option<Vec<PathBuf>> {
     let frames = folder.join("frames");
     fs::create_dir(&frames).unwrap();
@@ -711,7 +711,7 @@ fn several_films_are_posed_together() {
         .map(|entry| entry.unwrap().file_name().into_string().unwrap())
         .filter(|name| name.ends_with(".jpg"))
         .collect();
-    // Each of the photographs once.
+    // Each photograph is chosen once.
     for film in ["first_", "second_"] {
         let count = names.iter().filter(|name| name.starts_with(film)).count();
         assert!((15..=22).contains(&count), "{film}: {count}");
@@ -729,7 +729,7 @@ fn films_are_read_as_they_look_and_damaged_ones_left_out() {
     };
     let photos = folder.path().join("photos");
     fs::create_dir(&photos).unwrap();
-    // Pixels twice as wide as high, in a folder whose name is a pattern of ffmpeg's.
+    // Pixels twice as wide as high, and an output folder whose name looks like an ffmpeg pattern.
     let made = Command::new("ffmpeg")
         .args(["-loglevel", "error", "-y", "-i"])
         .arg(&films[0])

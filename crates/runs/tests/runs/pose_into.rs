@@ -37,7 +37,7 @@ fn photographs_are_added_to_a_dataset_whose_poses_stay() {
     let after = positions();
     assert_eq!(after.len(), before.len() + later.len());
     assert!(before.iter().all(|view| after.contains(view)), "poses stay");
-    // Of a dataset that others made, the model is put away, and other models and files stay.
+    // If another program made the dataset, its model is put away; other models and files stay.
     fs::remove_file(data.join("pose.json")).unwrap();
     let sparse = data.join("sparse");
     fs::create_dir(sparse.join("1")).unwrap();
@@ -56,7 +56,7 @@ fn photographs_are_added_to_a_dataset_whose_poses_stay() {
     assert!(sparse.join("0/project.ini").is_file() && sparse.join("1/images.bin").is_file());
     assert_eq!(fs::read(data.join("unused/sparse/0/images.bin")).unwrap(), theirs);
     assert!(before.iter().all(|view| positions().contains(view)), "poses stay");
-    // Photographs in folders of `images` are found there.
+    // Photographs in subfolders of `images` are found.
     fs::create_dir(data.join("images/left")).unwrap();
     fs::rename(data.join("images/00.png"), data.join("images/left/00.png")).unwrap();
     let images = sparse.join("0/images.bin");
@@ -68,7 +68,7 @@ fn photographs_are_added_to_a_dataset_whose_poses_stay() {
     quietly(&input).unwrap();
     assert!(before.iter().all(|view| positions().contains(view)), "poses stay");
     fs::remove_file(at("more").join("other.png")).unwrap();
-    // Nothing new, and no dataset at all, are told in one line.
+    // Having nothing to add, or no dataset at all, is reported in one line.
     let error = quietly(&input).unwrap_err().to_string();
     assert!(error.contains("no photograph to add"), "{error}");
     let mut nowhere = PoseInput::new(at("more"), at("photos"));

@@ -205,7 +205,7 @@ fn a_process_that_died_before_its_run_began_leaves_no_run() {
     again().expect("a run");
 }
 
-/// As written by the first builds of 0.1.0: no recipe, and `lpips` in later ones only.
+/// A file as written by the first builds of 0.1.0: no recipe, and `lpips` in later ones only.
 #[test]
 fn an_old_run_json_is_read() {
     let text = r#"{

@@ -1,4 +1,4 @@
-//! What turns before a background that stands still: poses and masks.
+//! Objects that turn in front of a still background: poses and masks.
 
 use glam::Vec3;
 use irradia_runs::formats::{DatasetOptions, read_dataset, read_image, write_png};
@@ -11,24 +11,24 @@ use std::path::Path;
 const SIZE: [u32; 2] = [320, 240];
 /// Photographs around the scene.
 const RING: usize = 32;
-/// Nothing of the table is as far from its cameras.
+/// Distance from the cameras beyond which everything is background.
 const FAR: f32 = 6.0;
 
-/// `[photographs][H, W]` whether it is background.
+/// `[photographs][H, W]` whether each pixel is background.
 type Backgrounds = Vec<Vec<bool>>;
 
-/// What the demo scene turns before.
+/// What is behind the turning demo scene.
 #[derive(Clone, Copy, PartialEq)]
 enum Behind {
-    /// The camera moves around it: its own sky.
+    /// The scene's own sky: the camera moves around the scene.
     Sky,
-    /// A wall of patches that stands still.
+    /// A still wall of patches.
     Wall,
-    /// Paper, lit from one side, in light that changes, that stands still.
+    /// Still paper, lit from one side, in changing light.
     Paper,
 }
 
-/// Writes photographs all around the demo scene, from heights that differ by `wave`.
+/// Writes photographs all around the demo scene, from heights that vary by `wave`.
 fn turntable(photos: &Path, behind: Behind, wave: f32) -> Backgrounds {
     fs::create_dir_all(photos).unwrap();
     let scene = SceneName::Demo.build(1).0;
@@ -75,7 +75,7 @@ fn posed(photos: &Path, out: &Path) -> PoseReport {
     pose(&PoseInput::new(photos, out), &|_| {}).unwrap()
 }
 
-/// Degrees from each photograph to the next.
+/// Angle from each photograph to the next, degrees.
 fn steps(out: &Path) -> Vec<f32> {
     let dataset = read_dataset(out, &DatasetOptions::default()).unwrap();
     assert_eq!(dataset.views.len(), RING);
@@ -86,7 +86,7 @@ fn steps(out: &Path) -> Vec<f32> {
     dataset.views.windows(2).map(turn).collect()
 }
 
-/// The fractions of the pixels of the background that are masked, and of the others that are not.
+/// The fraction of background pixels that are masked, and the fraction of other pixels that are not.
 fn right(masks: &Path, backgrounds: &Backgrounds) -> [f64; 2] {
     let (mut behind, mut before) = ([0usize; 2], [0usize; 2]);
     for (i, far) in backgrounds.iter().enumerate() {
@@ -127,12 +127,12 @@ fn what_turns_is_posed_and_what_stands_still_behind_it_is_masked() {
     let [behind, before] = right(&masks, &backgrounds);
     assert!(behind > 0.93 && before > 0.93, "{behind} {before}");
 
-    // All of it is known the second time.
+    // A second call gives the same result.
     let model = fs::read(out.join("sparse/0/images.bin")).unwrap();
     let again = posed(&photos, &out);
     assert_eq!(again.warnings, report.warnings);
     assert_eq!(fs::read(out.join("sparse/0/images.bin")).unwrap(), model);
-    // In place, its own masks are not taken for the user's; those that somebody edited are put away.
+    // When posing in place, the program's own masks do not count as the user's; masks that were edited are put away.
     let edited = masks.join("00.png.png");
     fs::write(&edited, fs::read(masks.join("01.png.png")).unwrap()).unwrap();
     let kept = fs::read(&edited).unwrap();
@@ -143,7 +143,7 @@ fn what_turns_is_posed_and_what_stands_still_behind_it_is_masked() {
     );
     assert_eq!(fs::read_dir(&masks).unwrap().count(), RING + 1);
     assert_eq!(fs::read(out.join("unused/masks/00.png.png")).unwrap(), kept);
-    // Photographs with masks of their own keep these.
+    // Photographs with masks of their own keep them.
     let own = folder.path().join("own");
     fs::create_dir(&own).unwrap();
     fs::rename(&photos, own.join("images")).unwrap();
@@ -153,7 +153,7 @@ fn what_turns_is_posed_and_what_stands_still_behind_it_is_masked() {
     let kept = posed(&own, &folder.path().join("kept"));
     assert!(kept.warnings.is_empty(), "{:?}", kept.warnings);
     assert_eq!(fs::read_dir(folder.path().join("kept/masks")).unwrap().count(), 1);
-    // Where nothing stands still any more, nothing is masked any more.
+    // If nothing stands still any more, nothing is masked.
     turntable(&photos, Behind::Sky, 0.1);
     assert!(posed(&photos, &out).warnings.is_empty());
     assert!(!masks.exists());
@@ -168,7 +168,7 @@ fn a_plain_backdrop_is_masked_where_the_poses_are_those_of_a_turntable() {
     let report = posed(&photos, &out);
     assert_eq!(report.registered, RING, "{report:?}");
     let [behind, before] = right(&masks, &backgrounds);
-    // What shows through the frames is not joined to the border, and bars are two pixels wide.
+    // Backdrop seen through the frames is not connected to the border, and bars are two pixels wide.
     assert!(behind > 0.87 && before > 0.87, "{behind} {before}");
     let of = |report: &PoseReport| {
         report
@@ -179,7 +179,7 @@ fn a_plain_backdrop_is_masked_where_the_poses_are_those_of_a_turntable() {
     };
     assert_eq!(of(&report), 1, "{:?}", report.warnings);
 
-    // By hand, no axis stands still.
+    // With a handheld camera, no axis stands still.
     turntable(&photos, Behind::Paper, 0.3);
     assert_eq!(of(&posed(&photos, &out)), 0);
     assert!(!masks.exists());

@@ -1,4 +1,4 @@
-//! Photographs by wide lenses are cut into faces, which show what pinholes see in their directions.
+//! Photographs by wide lenses are cut into faces, which equal pinhole photographs in their directions.
 
 use crate::folder;
 use irradia_runs::formats::{DatasetOptions, read_dataset};
@@ -55,7 +55,7 @@ fn faces_are_right(lens: SynthLens, (width, height): (u32, u32), expected: &[&st
             (view.camera.intrinsics.width, view.camera.intrinsics.height)
         );
         let found = psnr(&photo.data, &capture.trace(&shot).color.data);
-        // What is lost is lost by the resampling: a face of another direction has less than 15 dB.
+        // Only resampling loses quality: a face of the wrong direction has less than 15 dB.
         assert!(found > 27.0, "{}: {found} dB", view.name);
     }
 }

@@ -1,4 +1,4 @@
-//! Datasets far from the origin and in unusual units train like others, and their results have their coordinates.
+//! Datasets far from the origin or in unusual units train like others, and their results are in their own coordinates.
 
 use crate::folder;
 use irradia_runs::formats::read_points_ply;
@@ -84,7 +84,7 @@ fn a_dataset_in_millimetres_500_km_away_trains_alike_and_is_exported_to_the_mill
     }
     move_away(&folder.path().join("far"));
     let [near, away] = ["near", "far"].map(|name| train(folder.path(), name));
-    // The cameras' median becomes the origin, so that rounding differs, and nothing else.
+    // The cameras' median becomes the origin, so only rounding differs.
     assert!((near - away).abs() < 0.05, "{near} and {away} dB");
 
     let cameras = |name: &str| -> Value {
@@ -95,14 +95,14 @@ fn a_dataset_in_millimetres_500_km_away_trains_alike_and_is_exported_to_the_mill
     let [here, there] = ["near", "far"].map(cameras);
     for (here, there) in here.as_array().unwrap().iter().zip(there.as_array().unwrap()) {
         let expected = far(position(here));
-        // Millimetres: f32 keeps a thousandth of one at 10 m.
+        // In millimetres: at 10 m, f32 resolves a thousandth of one.
         assert!((0..3).all(|i| (position(there)[i] - expected[i]).abs() < 1e-2));
     }
 
     let scenes = ["near", "far"].map(|name| Scene::read(folder.path().join(format!("{name}.run"))).unwrap());
     let world = scenes[1].world_from_dataset;
     assert!(scenes[0].world_from_dataset.is_identity() && (world.scale - 1e-3).abs() < 1e-12);
-    // Nothing densifies within 60 steps: both have the same splats, which moved by less than their size.
+    // No densification occurs within 60 steps: both have the same splats, which moved by less than their size.
     let means = scenes.map(|scene| {
         let splats = scene.model.splats().unwrap().clone();
         let of = |i: usize| in_dataset(&scene, splats.mean(i));

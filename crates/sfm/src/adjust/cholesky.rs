@@ -1,15 +1,15 @@
-//! Dense symmetric positive definite systems of some thousand unknowns.
+//! Dense symmetric positive definite systems of a few thousand unknowns.
 
 use irradia_compute::simd::{Kernel, Lanes, Level, Simd};
 use rayon::prelude::*;
 
-/// Rows factorised before the rest of the matrix is updated: a panel stays in the second cache.
+/// Rows factorised before the rest of the matrix is updated: a panel stays in the second-level cache.
 const PANEL: usize = 32;
 
-/// A symmetric matrix of which the upper triangle is stored, row by row.
+/// A symmetric matrix whose upper triangle is stored, row by row.
 #[derive(Clone, Debug, Default)]
 pub struct Symmetric {
-    /// Rows and columns.
+    /// Number of rows and columns.
     pub n: usize,
     /// `[n, n]`; below the diagonal the values are unspecified.
     pub values: Vec<f64>,
@@ -116,7 +116,7 @@ struct Update<'a> {
 impl Kernel for Update<'_> {
     type Output = ();
 
-    // Plain f64 code: here it is compiled with the wide instructions, twice as fast as without.
+    // Plain f64 code: inside a kernel it is compiled for the widest instruction set, which is twice as fast.
     #[inline(always)]
     fn run<S: Simd>(self, _: S)
     where
@@ -147,7 +147,7 @@ impl Kernel for Update<'_> {
 
 /// Solves `a x = b` by conjugate gradients, preconditioned by the diagonal blocks `blocks` (first row, size); `x` starts at zero.
 ///
-/// Stops at a residual of `tolerance` times that of `b`, or after `iterations`.
+/// Stops at a residual norm of `tolerance` times the norm of `b`, or after `iterations`. `None` if a matrix is not positive definite.
 pub fn conjugate_gradients(
     a: &Symmetric,
     b: &[f64],

@@ -1,7 +1,7 @@
-//! Bundle adjustment: poses, points and shared intrinsics that minimise the reprojection errors.
+//! Bundle adjustment: finds the poses, points and shared intrinsics that minimise the reprojection errors.
 //!
-//! Levenberg and Marquardt's method with analytic Jacobians. Points are eliminated (Schur complement); what remains is a dense
-//! symmetric system over poses and cameras, solved by Cholesky's factorisation or, beyond [`DIRECT_LIMIT`] unknowns, by
+//! The Levenberg-Marquardt method with analytic Jacobians. Points are eliminated (Schur complement); what remains is a dense
+//! symmetric system over poses and cameras, solved by Cholesky factorisation or, beyond [`DIRECT_LIMIT`] unknowns, by
 //! conjugate gradients. Every sum has a fixed order: the result does not depend on the number of threads.
 
 mod cholesky;
@@ -17,31 +17,32 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 use schur::Linearization;
 
-/// Unknowns of poses and cameras beyond which conjugate gradients are used: 2,000 photographs. On two cores the direct solution takes 0.13 s of 2,400 unknowns that all depend on
-/// one another and 0.88 s of 4,800; 200 iterations take 0.7 s and 2.7 s, and end before they have converged.
+/// Number of unknowns of poses and cameras beyond which conjugate gradients are used: 2,000 photographs. On two cores the direct
+/// solution of a full system takes 0.13 s for 2,400 unknowns and 0.88 s for 4,800; 200 iterations of conjugate gradients take 0.7 s
+/// and 2.7 s, and stop before they have converged.
 pub const DIRECT_LIMIT: usize = 12_000;
 
-/// Which intrinsics of a camera are adjusted; the others are held.
+/// Which intrinsics of a camera are adjusted; the others are held fixed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Freedom {
     /// The focal length.
     pub focal: Focal,
     /// The principal point.
     pub principal: bool,
-    /// How many of k1, k2.
+    /// How many of the radial coefficients k1, k2.
     pub radial: usize,
-    /// p1 and p2.
+    /// The tangential coefficients p1 and p2.
     pub tangential: bool,
 }
 
 /// How the focal length is adjusted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Focal {
-    /// Not at all.
+    /// It is held fixed.
     Held,
-    /// The ratio of fx and fy is kept.
+    /// fx and fy are adjusted together; their ratio is kept.
     Tied,
-    /// fx and fy on their own.
+    /// fx and fy are adjusted independently.
     Free,
 }
 
@@ -54,7 +55,7 @@ impl Freedom {
         tangential: false,
     };
 
-    /// With the principal point, in place of p1 and p2: both do nearly the same, and together they hardly converge.
+    /// With the principal point adjusted instead of p1 and p2: their effects are nearly the same, and together they hardly converge.
     pub fn with_principal(self) -> Self {
         Self {
             principal: true,
@@ -79,19 +80,19 @@ impl Freedom {
     }
 }
 
-/// A camera, what of it is adjusted, and what is believed of it.
+/// A camera, the intrinsics that are adjusted, and the prior on them.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AdjustedCamera {
     /// The camera.
     pub camera: DCamera,
-    /// What is adjusted.
+    /// Which intrinsics are adjusted.
     pub freedom: Freedom,
-    /// What is believed.
+    /// The prior.
     pub belief: Belief,
 }
 
 impl AdjustedCamera {
-    /// Nothing is believed.
+    /// A camera without a prior.
     pub fn new(camera: DCamera, freedom: Freedom) -> Self {
         Self {
             camera,
@@ -101,17 +102,17 @@ impl AdjustedCamera {
     }
 }
 
-/// What is believed of a camera before it is adjusted: the cost has a term `weight (parameter - value)^2 / 2` for each.
+/// A Gaussian prior on the parameters of a camera: the cost has a term `weight (parameter - value)^2 / 2` for each.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Belief {
-    /// Values in the order of the parameters; that of fy is believed of `fy / fx`.
+    /// Expected values in the order of the parameters; in place of fy, the value of `fy / fx`.
     pub values: [f64; PARAMETERS],
     /// Weights, px^2 per squared unit of the parameter.
     pub weights: [f64; PARAMETERS],
 }
 
 impl Belief {
-    /// The differences from what is believed.
+    /// The differences from the expected values.
     fn errors(&self, camera: &DCamera) -> [f64; PARAMETERS] {
         let mut errors = camera.parameters;
         errors[1] /= errors[0];
@@ -136,7 +137,7 @@ pub struct View {
 }
 
 impl View {
-    /// A camera that has the pose itself.
+    /// A camera whose own pose is the pose.
     pub fn new(pose: u32, camera: u32) -> Self {
         Self {
             pose,
@@ -151,24 +152,25 @@ impl View {
 pub struct Observation {
     /// Index of the view.
     pub view: u32,
-    /// Measured place, pixels.
+    /// Measured position, pixels.
     pub at: DVec2,
 }
 
-/// What is adjusted. Fields are public: a caller fills them, calls [`Problem::solve`] and reads the results in the same place.
+/// A bundle adjustment problem. Fields are public: a caller fills them, calls [`Problem::solve`] and reads the results from the same
+/// fields.
 #[derive(Clone, Debug, Default)]
 pub struct Problem {
     /// `[C]` cameras.
     pub cameras: Vec<AdjustedCamera>,
     /// `[P]` poses.
     pub poses: Vec<DPose>,
-    /// `[P]` whether a pose is held.
+    /// `[P]` whether a pose is held fixed.
     pub held_poses: Vec<bool>,
     /// Photographs.
     pub views: Vec<View>,
     /// `[N]` points.
     pub points: Vec<DVec3>,
-    /// `[N]` whether a point is held.
+    /// `[N]` whether a point is held fixed.
     pub held_points: Vec<bool>,
     /// Observations, sorted by point.
     pub observations: Vec<Observation>,
@@ -176,32 +178,33 @@ pub struct Problem {
     pub starts: Vec<u32>,
 }
 
-/// How to adjust.
+/// Options of an adjustment.
 #[derive(Clone, Copy, Debug)]
 pub struct AdjustOptions {
     /// The loss of each observation's squared error.
     pub loss: Loss,
-    /// Iterations at most.
+    /// Maximum number of iterations.
     pub iterations: usize,
     /// Stop when an iteration lowers the cost by less than this fraction.
     pub tolerance: f64,
 }
 
-/// What an adjustment did.
+/// The outcome of an adjustment.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AdjustReport {
     /// Half the sum of losses before, px^2.
     pub initial_cost: f64,
     /// Half the sum of losses after, px^2.
     pub final_cost: f64,
-    /// Linear systems solved.
+    /// Number of linear systems solved.
     pub iterations: usize,
     /// Whether the last step was below the tolerance.
     pub converged: bool,
 }
 
 impl Problem {
-    /// Half the sum of the losses at the present values, px^2. Points behind a camera count as far away.
+    /// Half the sum of the losses plus the terms of the priors at the current values, px^2; infinite if a point is behind a camera that
+    /// observes it.
     pub fn cost(&self, loss: Loss) -> f64 {
         self.cost_at(&self.state(), loss)
     }
@@ -291,7 +294,7 @@ impl Problem {
         0.5 * sums.iter().sum::<f64>() + self.belief_cost(state)
     }
 
-    /// The terms of what is believed of the cameras.
+    /// The cost of the priors on the cameras.
     fn belief_cost(&self, state: &State) -> f64 {
         self.cameras
             .iter()
@@ -300,7 +303,7 @@ impl Problem {
             .sum()
     }
 
-    /// Ranges of points of about equal numbers of observations; they depend on the problem alone.
+    /// Ranges of points with about equal numbers of observations; they depend only on the problem.
     fn pieces(&self) -> Vec<std::ops::Range<usize>> {
         let goal = (self.observations.len() / 64).max(256) as u32;
         let mut pieces = Vec::new();
@@ -326,7 +329,7 @@ struct State {
     points: Vec<DVec3>,
 }
 
-/// A view at the present values.
+/// A view at the current values.
 struct ViewNow {
     /// From world to camera axes.
     rotation: DMat3,

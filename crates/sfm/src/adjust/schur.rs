@@ -1,6 +1,6 @@
 //! The normal equations of one iteration, with the points eliminated.
 //!
-//! Blocks: a pose has 6 unknowns (turn in camera axes, shift of the centre), a camera 8, of which held ones have no equation.
+//! Blocks: a pose has 6 unknowns (rotation in camera axes, shift of the centre), a camera 8, of which fixed ones have no equation.
 //! Symbols: per observation r (residual), A = dr/dpose, B = dr/dpoint, K = dr/dcamera, all weighted by the root of the loss's
 //! slope; per point V = sum B^T B + damping; per point and block W = A^T B or K^T B.
 
@@ -35,9 +35,9 @@ const DIAGONAL: (f64, f64) = (1e-6, 1e32);
 
 /// The normal equations and the structure that does not change between iterations.
 pub(super) struct Linearization {
-    /// `[P]` the block of a pose, or NONE when it is held.
+    /// `[P]` the block of a pose, or NONE when it is held fixed.
     pose_block: Vec<u32>,
-    /// `[C]` the block of a camera, or NONE when it is held.
+    /// `[C]` the block of a camera, or NONE when it is held fixed or not observed.
     camera_block: Vec<u32>,
     pose_blocks: usize,
     camera_blocks: usize,
@@ -56,7 +56,7 @@ pub(super) struct Linearization {
     w: Vec<[[f64; POSE]; 3]>,
     /// Per entry of `groups`, sums over the point's observations of `K^T B`, `[3][8]`.
     wk: Vec<[[f64; PARAMETERS]; 3]>,
-    /// Per camera block and unknown: second and first derivative of what is believed.
+    /// Per camera block and unknown: second and first derivative of the prior's cost.
     beliefs: Vec<[[f64; 2]; PARAMETERS]>,
     /// Per point: sum of `B^T B` and of `B^T r`.
     v: Vec<(DMat3, DVec3)>,
@@ -189,7 +189,7 @@ impl Linearization {
                         let (mask, ratio) = columns[problem.views[observation.view as usize].camera as usize];
                         for e in 0..2 {
                             let by = projection.by_point[e] * root;
-                            // d camera point / d turn is the cross product turn x p, in the pose's axes; / d point is the rotation.
+                            // d camera point / d turn: the cross product turn x p, in the pose's axes; / d point: the rotation.
                             let turn = view.mount * p.cross(by);
                             let point = view.rotation.transpose() * by;
                             row.a[e] = [turn.x, turn.y, turn.z, -point.x, -point.y, -point.z];
@@ -233,7 +233,7 @@ impl Linearization {
                 let columns = adjusted.freedom.columns();
                 let (errors, weights) = (adjusted.belief.errors(now), adjusted.belief.weights);
                 std::array::from_fn(|i| {
-                    // The ratio fy / fx moves by 1 / fx as fy moves.
+                    // The derivative of the ratio fy / fx by fy is 1 / fx.
                     let slope = if i == 1 { 1.0 / now.parameters[0] } else { 1.0 };
                     let weight = if columns[i] { weights[i] * slope } else { 0.0 };
                     [weight * slope, weight * errors[i]]
@@ -278,7 +278,8 @@ impl Linearization {
         Some(self.substitute(problem, &inverses, solution, &diagonal, damping))
     }
 
-    /// The system over poses and cameras: matrix, gradient (the negated right side), undamped diagonal and gradient.
+    /// The system over poses and cameras: matrix, gradient with the points eliminated (the negated right side), and the undamped
+    /// diagonal with the gradient before elimination.
     fn reduce(
         &self,
         problem: &Problem,
@@ -311,7 +312,7 @@ impl Linearization {
                     diagonal,
                 });
             });
-        // One shared camera sees every point: its sums are cut into pieces, added in their order.
+        // A shared camera may see every point: its sums are split into pieces that are added in order.
         let pieces = 16usize.div_ceil(self.camera_blocks.max(1));
         for c in 0..self.camera_blocks {
             let entries = &self.of_camera[c];
@@ -342,7 +343,7 @@ impl Linearization {
                 camera_diagonal[c * PARAMETERS + i][1] += first;
                 rows[i * n + cameras_at + c * PARAMETERS + i] += second;
                 let own = camera_diagonal[c * PARAMETERS + i][0];
-                // A held parameter has no equation: its own unknown is then zero.
+                // A fixed parameter has no equation: a 1 on the diagonal makes its unknown zero.
                 let damped = if own == 0.0 {
                     1.0
                 } else {
@@ -407,7 +408,7 @@ impl Linearization {
         part
     }
 
-    /// The whole step from that of poses and cameras.
+    /// The full step, with the points substituted back from the step of poses and cameras.
     fn substitute(
         &self,
         problem: &Problem,
@@ -467,7 +468,7 @@ impl Linearization {
     }
 }
 
-/// What Levenberg and Marquardt's method adds to the diagonal of V.
+/// What the Levenberg-Marquardt method adds to the diagonal of V.
 fn damp(x: f64, y: f64, z: f64, damping: f64) -> DVec3 {
     damping * DVec3::new(x, y, z).clamp(DVec3::splat(DIAGONAL.0), DVec3::splat(DIAGONAL.1))
 }
@@ -508,7 +509,7 @@ struct CameraPart {
     minus: Vec<(u32, [[f64; PARAMETERS]; PARAMETERS])>,
 }
 
-/// The six rows of one pose in the reduced system, in which every term belongs to one task alone.
+/// The six rows of one pose in the reduced system; every row is written by one task only.
 struct PoseRows<'a> {
     of: &'a Linearization,
     problem: &'a Problem,
@@ -524,7 +525,7 @@ struct PoseRows<'a> {
 impl Kernel for PoseRows<'_> {
     type Output = ();
 
-    // Plain f64 code: here it is compiled with the wide instructions.
+    // Plain f64 code: inside a kernel it is compiled for the widest instruction set.
     #[inline(always)]
     fn run<S: Simd>(self, _: S)
     where

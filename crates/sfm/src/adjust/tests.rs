@@ -2,7 +2,7 @@ use super::*;
 use glam::DQuat;
 use irradia_scene::Rng;
 
-/// Cameras on an arc around random points, with noise of `noise` px, and the exact problem.
+/// The exact problem of cameras on an arc around random points, observed with noise of `noise` px, and a perturbed copy of it.
 fn world(poses: usize, points: usize, cameras: usize, noise: f64, seed: u64) -> (Problem, Problem) {
     let mut rng = Rng::new(seed, 0);
     let mut normal = |scale: f64| scale * f64::from(rng.normal());
@@ -120,7 +120,7 @@ fn held_values_do_not_move() {
     assert_eq!((now[2], now[3], now[5], now[6]), (then[2], then[3], then[5], then[6]));
 }
 
-/// Both sides of the solution cost more, by as much, in every direction: finite differences of the cost alone.
+/// The cost rises equally on both sides of the solution in every direction, measured by finite differences of the cost alone.
 #[test]
 fn the_gradient_vanishes_at_the_solution() {
     for (loss, cameras) in [(Loss::Squared, 1), (Loss::SoftL1(1.0), 2), (Loss::Cauchy(2.0), 8)] {
@@ -147,7 +147,7 @@ fn the_gradient_vanishes_at_the_solution() {
         let slope = |name: &str, scale: f64, moved: &dyn Fn(&mut Problem, f64)| {
             let h = H * scale;
             let (plus, minus) = (cost(&|p| moved(p, h)), cost(&|p| moved(p, -h)));
-            // At a minimum both sides rise alike: the difference is small against the rise.
+            // At a minimum both sides rise equally: their difference is small relative to the rise.
             let rise = plus + minus - 2.0 * report.final_cost;
             assert!(
                 rise > 0.0 && (plus - minus).abs() < 0.05 * rise,
@@ -205,13 +205,13 @@ fn points_behind_a_camera_do_not_break_it() {
     assert!(Problem::default().solve(&PRECISE).final_cost == 0.0);
 }
 
-/// One pose, one point, nothing to see but what is believed.
+/// One pose and free points: only the priors determine the camera.
 #[test]
 fn what_is_believed_of_a_camera_decides_where_nothing_else_does() {
     let (_, mut problem) = world(1, 30, 1, 0.0, 6);
     problem.held_poses[0] = true;
     problem.cameras[0].freedom = EVERYTHING;
-    // Each point can follow any camera: only beliefs have a minimum.
+    // Each point can follow any camera: only the priors have a minimum.
     problem.cameras[0].belief = Belief {
         values: [510.0, 1.01, 322.0, 241.0, 0.02, -0.02, 0.0, 0.0],
         weights: [1e2, 1e6, 1e2, 1e2, 1e6, 1e6, 1e6, 1e6],
@@ -232,9 +232,9 @@ fn what_is_believed_of_a_camera_decides_where_nothing_else_does() {
     }
 }
 
-/// Known answers, made once with SciPy 1.17's `least_squares` (trf, all tolerances 1e-15, rotation vectors, translations, points,
-/// f and k1 free, numeric Jacobian) on the same formulas; for Cauchy's loss each observation's residual was scaled to the root of its
-/// loss.
+/// Reference values, computed once with SciPy 1.17's `least_squares` (trf, all tolerances 1e-15, rotation vectors, translations,
+/// points, f and k1 free, numeric Jacobian) on the same formulas; for the Cauchy loss each observation's residual was scaled to the
+/// root of its loss.
 #[test]
 fn the_final_cost_is_that_of_an_independent_solver() {
     for (loss, start, answer, focal) in [
@@ -268,11 +268,11 @@ fn the_final_cost_is_that_of_an_independent_solver() {
 
 #[test]
 fn cameras_on_a_rig_move_with_it() {
-    // The same cameras, two to a pose: each second one is mounted on the one before it.
+    // The same cameras, two per pose: every second one is mounted on the one before it.
     let (exact, mut problem) = world(8, 60, 1, 0.0, 5);
     for i in (0..8).step_by(2) {
         let [first, second] = [exact.poses[i], exact.poses[i + 1]];
-        // Where the rig is, with the axes of each of its cameras.
+        // The position of the rig, with the axes of each of its cameras.
         for (view, pose) in [(i, first), (i + 1, second)] {
             problem.views[view] = View {
                 mount: first.rotation.inverse() * pose.rotation,

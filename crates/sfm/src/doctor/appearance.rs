@@ -1,23 +1,23 @@
-//! What the pixels of a photograph tell beside its features.
+//! Sharpness and exposure of a photograph, measured from its pixels.
 
-/// Levels at which a pixel has no detail left, of 255.
+/// Levels, of 255, at and above (white) or at and below (black) which a pixel has no detail left.
 const WHITE: u8 = 250;
 const BLACK: u8 = 4;
 /// Side of the blocks in which sharpness is measured, px.
 const BLOCK: usize = 32;
-/// The sharpest part of the blocks: a near subject before a background out of focus is sharp.
+/// Fraction of the blocks that count, the sharpest: a near subject in front of an unfocused background is sharp.
 const SHARPEST: f64 = 0.2;
-/// Distance of the coarse differences, px.
+/// Distance between the pixels of a coarse difference, px.
 const COARSE: usize = 8;
-/// The picture is reduced until its long side is at most this, px: the blur of single pixels of large photographs does no harm.
+/// The photograph is reduced until its long side is at most this, px: a blur of single pixels in large photographs does no harm.
 const LONG_SIDE: usize = 1000;
 
-/// Figures of a photograph's pixels.
+/// Measurements of a photograph's pixels.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Appearance {
-    /// Energy of differences over one pixel by that over eight, in the direction where it is least, within the sharpest fifth
-    /// of the picture: about 0.12 on sharp edges, and less the wider they are. It depends little on what is shown
-    /// (after Crete et al., "The blur effect", 2007, who compare a picture with its blurred self). 0 if there is no contrast.
+    /// Energy of differences over one pixel relative to that over eight, in the direction where it is smallest, within the sharpest
+    /// fifth of the photograph: about 0.12 on sharp edges, and less the wider they are. It depends little on what is shown
+    /// (after Crete et al., "The blur effect", 2007, who compare an image with a blurred copy). 0 if there is no contrast.
     pub sharpness: f32,
     /// Mean brightness in \[0, 1\].
     pub brightness: f32,
@@ -25,7 +25,7 @@ pub struct Appearance {
     pub white: f32,
     /// Fraction of the pixels that are black.
     pub black: f32,
-    /// Fraction of the pixels that are masked; they count for none of the figures before.
+    /// Fraction of the pixels that are masked; the other figures leave them out.
     pub hidden: f32,
 }
 
@@ -72,11 +72,11 @@ impl Appearance {
     }
 }
 
-/// A picture at the size at which sharpness is measured.
+/// A photograph at the size at which sharpness is measured.
 struct Reduced {
     width: usize,
     height: usize,
-    /// Sums of the reduced pixels; `NAN` where masked.
+    /// Means of the pixels that were reduced to one; `NAN` where masked.
     grey: Vec<f32>,
 }
 
@@ -110,7 +110,7 @@ impl Reduced {
         for y in y0..y0 + BLOCK {
             for x in x0..x0 + BLOCK {
                 let at = |dx: usize, dy: usize| self.grey[(y + dy) * self.width + x + dx];
-                // Both diagonals start at the same corner rows, so that all directions see the same pixels.
+                // Both diagonals start in the same rows, so that all directions use the same pixels.
                 for (sum, [from, near, far]) in sums.iter_mut().zip([
                     [at(0, 0), at(1, 0), at(COARSE, 0)],
                     [at(0, 0), at(0, 1), at(0, COARSE)],
@@ -141,7 +141,7 @@ impl Reduced {
         blocks.truncate(((blocks.len() as f64 * SHARPEST) as usize).max(4));
         let ratio = |direction: usize| {
             let [fine, coarse] = [0, 1].map(|scale| blocks.iter().map(|block| block[direction][scale]).sum::<f64>());
-            // A grey level of noise in every pixel is no contrast.
+            // Noise of one grey level in every pixel is not contrast.
             let least = (blocks.len() * BLOCK * BLOCK) as f64;
             if coarse > least { fine / coarse } else { 0.0 }
         };

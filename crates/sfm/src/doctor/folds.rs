@@ -1,7 +1,7 @@
-//! Pairs that cannot be right together: parts of a scene that look alike fold it.
+//! Pairs that cannot all be right: parts of a scene that look alike fold the model.
 //!
-//! A two-view rotation may be wrong without harm: two fit a plane, and with little parallax many do. So a pair contradicts the
-//! rest only if no motion near the rotation that the rest predicts explains its matches.
+//! A wrong two-view rotation does not prove a wrong pair: two rotations fit a plane, and with little parallax many fit. A pair
+//! therefore contradicts the rest only if no motion near the rotation that the rest predicts explains its matches.
 
 use super::{Diagnosis, Evidence, Turns, turns};
 use crate::Features;
@@ -13,21 +13,21 @@ use glam::{DQuat, DVec2};
 use irradia_scene::Rng;
 use rayon::prelude::*;
 
-/// Disagreement with the prediction from which on another motion is sought, radians.
+/// Minimum disagreement with the prediction at which another motion is searched for, radians.
 const DOUBTFUL: f64 = 0.17;
-/// Farthest from the prediction that such a motion may be, radians.
+/// Maximum angle between such a motion and the prediction, radians.
 const NEAR: f64 = 0.26;
-/// Directions of the translation that are tried.
+/// Number of translation directions that are tried.
 const TRIES: usize = 50;
-/// Errors at which matches agree, on the plane z = 1: roughly with a predicted rotation a few degrees off, then in steps.
+/// Errors up to which matches agree, on the plane z = 1: first coarse, for a predicted rotation a few degrees off, then finer.
 const STEPS: [f64; 3] = [0.06, 0.03, 0.012];
-/// The last is about eight pixels at the usual focal length: the lens is unknown yet.
+/// The final such error, about eight pixels at the usual focal length: the lens is still unknown.
 const AGREES: f64 = 0.01;
-/// Fraction of its matches that must agree with the rest.
+/// Minimum fraction of a pair's matches that agree with the rest.
 const EXPLAINED: f64 = 0.6;
-/// Fraction of the pairs without any motion near the prediction from which on the prediction is not believed.
+/// Fraction of pairs without any motion near the prediction at which the prediction is rejected.
 const UNSETTLED: f64 = 0.15;
-/// Contradicting pairs from which on parts may be taken for one another.
+/// Minimum number of contradicting pairs for a diagnosis.
 const PAIRS: usize = 2;
 
 /// Rotations that agree with most pairs, and how well each pair agrees with them.
@@ -35,12 +35,12 @@ const PAIRS: usize = 2;
 pub struct Consistency {
     /// Rotations of all photographs.
     pub turns: Turns,
-    /// `[pairs]` the fraction of the matches that some motion near the predicted rotation explains.
+    /// `[pairs]` the fraction of the matches that are explained by some motion near the predicted rotation.
     pub agree: Vec<f64>,
 }
 
-/// Looks for loops of pairs that cannot close: rotations from all pairs, and for those that disagree another motion near the
-/// prediction, until no more agree.
+/// Finds pairs that do not fit into loops with the others: averages rotations over all pairs, and searches for another motion near
+/// the prediction for those that disagree, until no further pair agrees.
 pub fn consistency(
     photos: &[PhotoInfo],
     features: &[Features],
@@ -83,7 +83,7 @@ pub fn consistency(
 }
 
 impl Consistency {
-    /// Whether the rotations are those of most pairs: with long lenses, two-view rotations are ambiguous and often wrong.
+    /// Whether most pairs agree with the rotations: with long lenses, two-view rotations are ambiguous and often wrong.
     pub fn is_settled(&self) -> bool {
         let off = self.agree.iter().filter(|agree| **agree < 0.5).count();
         (off as f64) < UNSETTLED * self.agree.len() as f64
@@ -95,7 +95,7 @@ fn explained(motion: &Motion, points: &[[DVec2; 2]], threshold: f64) -> f64 {
     let essential = motion.essential();
     let agrees = |p: &&[DVec2; 2]| {
         sampson_squared(&essential, **p) < threshold * threshold
-            // Far points are as likely just behind as in front: both rays must point the same way.
+            // Distant points may be triangulated just behind the cameras, so only the rays are tested: both must point the same way.
             && (motion.rotation * p[0].extend(1.0)).dot(p[1].extend(1.0)) > 0.0
     };
     points.iter().filter(agrees).count() as f64 / points.len().max(1) as f64
@@ -139,7 +139,8 @@ fn near_prediction(points: &[[DVec2; 2]], predicted: DQuat, seed: u64) -> (f64, 
     (fraction, (fraction > EXPLAINED).then_some(motion.rotation))
 }
 
-/// Repeated structures: neighbours that disagree with the model, unless something moves in both: `moving` are such photographs.
+/// Diagnoses repeated structures: neighbours that disagree with the model, unless something moves in both (`moving` lists such
+/// photographs).
 pub(super) fn contradiction(evidence: &Evidence, moving: &[usize]) -> Vec<Diagnosis> {
     let Some(model) = evidence.model() else {
         return Vec::new();

@@ -1,17 +1,18 @@
-//! Lenses: several focal lengths, zooms that no metadata tell, focal lengths that cannot be known, principal points beside the middle.
+//! Lenses: several focal lengths, zooms that are not in the metadata, focal lengths that cannot be determined, and principal points
+//! away from the centre.
 
 use super::{Diagnosis, Evidence};
 use crate::map::{PairKind, Source, Zoom, determines_focal};
 
-/// Ratio of focal lengths in the metadata from which on they are two settings: less is breathing while the lens focuses.
+/// Minimum ratio of focal lengths in the metadata for two settings: smaller ones come from focus breathing.
 const SETTING: f64 = 1.08;
-/// Pairs that show depth, of all, from which on a focal length can be adjusted.
+/// Minimum fraction of pairs that show depth for a focal length to be adjustable.
 const GENERAL: f64 = 0.25;
-/// Distance of a principal point from the middle, by the long side, from which on a photograph was cut: those of phones are up to 1 % away, and those
-/// found by ten photographs up to 3 %.
+/// Minimum distance of a principal point from the centre, relative to the long side, for a photograph to count as cropped: those of
+/// phones are up to 1 % away, and those estimated from ten photographs up to 3 %.
 const BESIDE: f64 = 0.04;
 
-/// Focal lengths by the metadata.
+/// Several focal lengths in the metadata.
 pub(super) fn settings(evidence: &Evidence) -> Vec<Diagnosis> {
     let mut known: Vec<(f64, usize)> = evidence
         .photos
@@ -38,7 +39,7 @@ pub(super) fn settings(evidence: &Evidence) -> Vec<Diagnosis> {
     }
 }
 
-/// Photographs whose own focal lengths in the model part from those of their camera.
+/// Photographs whose focal lengths in the model differ from those of their camera.
 pub(super) fn zoom(evidence: &Evidence) -> Vec<Diagnosis> {
     let told = |zoom: &Zoom| Diagnosis::Zoom {
         photos: zoom.photos.clone(),
@@ -65,7 +66,7 @@ pub(super) fn own_focals(evidence: &Evidence) -> Vec<Diagnosis> {
     }
 }
 
-/// Photographs whose principal point the mapper found away from the middle.
+/// Photographs whose principal point the mapper found away from the centre.
 pub(super) fn cut(evidence: &Evidence) -> Vec<Diagnosis> {
     let Some(model) = evidence.model() else {
         return Vec::new();
@@ -90,7 +91,7 @@ pub(super) fn cut(evidence: &Evidence) -> Vec<Diagnosis> {
     }
 }
 
-/// Cameras of which any focal length fits.
+/// Cameras for which any focal length fits.
 pub(super) fn focal_unknown(evidence: &Evidence) -> Vec<Diagnosis> {
     let mut found = Vec::new();
     for (group, (_, source)) in evidence.cameras.iter().enumerate() {
@@ -107,7 +108,7 @@ pub(super) fn focal_unknown(evidence: &Evidence) -> Vec<Diagnosis> {
         };
         let general = pairs().filter(|pair| pair.kind == PairKind::General).count();
         let open = *source == Source::Guess && (general as f64) < GENERAL * pairs().count() as f64;
-        // What the pairs leave open, many photographs of a scene with depth may still determine together.
+        // Many photographs of a scene with depth together may determine what single pairs leave open.
         let determined = || {
             let model = evidence.model().filter(|model| model.cameras[group].is_some());
             model.is_some_and(|model| determines_focal(evidence.photos, evidence.features, model, group))

@@ -1,33 +1,33 @@
-//! Blur, exposure and texture of single photographs, relative to those that show the same.
+//! Blur, exposure and texture of single photographs, relative to others of the same part of the scene.
 
 use super::{Diagnosis, Evidence, Graph};
 use crate::median;
 
-/// How many times less sharp than its neighbours a photograph is at which it is blurred: up to 2.6 in sharp close-ups of plain
-/// surfaces, 2.9 and more where a hand shook.
+/// Ratio of the neighbours' sharpness to that of a photograph above which it is blurred: up to 2.6 in sharp close-ups of plain
+/// surfaces, 2.9 and more with camera shake.
 const BLURRED: f64 = 2.7;
-/// Neighbours with which a photograph is compared.
+/// Number of neighbours with which a photograph is compared.
 const NEIGHBOURS: usize = 6;
-/// Photographs before and after in the order of names that stand for neighbours where there are fewer than three partners.
+/// Number of photographs before and after, in the order of names, that are used as neighbours where there are fewer than three partners.
 const IN_ORDER: usize = 3;
 
-/// Stops from the neighbours at which an exposure jumps: phones vary by half a stop from photograph to photograph.
+/// Difference from the neighbours, in stops, above which the exposure jumps: phones vary by half a stop from photograph to photograph.
 const JUMP: f64 = 1.0;
-/// Levels between which a colour tells the exposure, of 255.
+/// Levels, of 255, at which a colour is evidence of the exposure.
 const TELLS: std::ops::RangeInclusive<u8> = 10..=245;
-/// Matches from which on a pair tells the difference in exposure.
+/// Minimum number of matches for a pair to determine the difference in exposure.
 const ENOUGH_COLORS: usize = 12;
-/// Fractions of white or black pixels, beyond the median over all photographs, at which a photograph is clipped.
+/// Fractions of white and of black pixels, above the median over all photographs, beyond which a photograph is clipped.
 const WHITE: f64 = 0.3;
 const BLACK: f64 = 0.4;
 
-/// Features below which a photograph has too few, and the fraction of the median below which it has.
+/// A photograph has too few features if it has fewer than this number, or fewer than this fraction of the median.
 const FEATURES: usize = 150;
 pub(super) const FEATURES_BY_MEDIAN: f64 = 0.1;
-/// The hidden fraction of a photograph from which on that, not texture or light, is what it lacks.
+/// Minimum hidden fraction of a photograph for its mask, rather than texture or light, to be the fault.
 const HIDDEN: f32 = 0.9;
 
-/// The photographs that show most of what `photo` shows.
+/// The photographs that share most with `photo`.
 fn neighbours(evidence: &Evidence, graph: &Graph, photo: usize) -> Vec<usize> {
     let mut found: Vec<usize> = graph.partners[photo].iter().take(NEIGHBOURS).map(|p| p.0).collect();
     if found.len() < IN_ORDER && !graph.is_on_rig(photo) {
@@ -50,7 +50,7 @@ pub(super) fn blurred(evidence: &Evidence, graph: &Graph) -> Vec<Diagnosis> {
             let neighbours = neighbours(evidence, graph, photo);
             let usual = median(neighbours.iter().map(|p| sharpness(*p)).collect())?;
             let own = sharpness(photo);
-            // Nothing to see is no blur.
+            // No contrast at all is not blur.
             (own > 0.0 && usual > BLURRED * own).then(|| Diagnosis::Blurred {
                 photo,
                 times: usual / own,
@@ -60,13 +60,13 @@ pub(super) fn blurred(evidence: &Evidence, graph: &Graph) -> Vec<Diagnosis> {
         .collect()
 }
 
-/// Linear light of an sRGB level, apart from a factor.
+/// Linear light of an sRGB colour, up to a factor.
 fn linear(color: [u8; 3]) -> f64 {
     let [r, g, b] = color.map(f64::from);
     (0.2126 * r + 0.7152 * g + 0.0722 * b).powf(2.2)
 }
 
-/// By how many stops the second photograph of each pair is brighter at its matches; `None` if too few tell.
+/// `[pairs]` how many stops the second photograph is brighter than the first at their matches; `None` if too few matches are usable.
 fn differences(evidence: &Evidence) -> Vec<Option<f64>> {
     let tells = |color: &[u8; 3]| color.iter().all(|c| TELLS.contains(c));
     let difference = |pair: &crate::map::VerifiedPair| {
@@ -125,7 +125,7 @@ pub(super) fn exposure(evidence: &Evidence, graph: &Graph) -> Vec<Diagnosis> {
                 bright: false,
             });
         } else if stops.is_none() && !graph.is_on_rig(photo) && own.hidden < HIDDEN {
-            // Without matches, the brightness of the whole picture is all there is.
+            // Without matches, only the brightness of the whole photograph can be compared.
             let neighbours = neighbours(evidence, graph, photo);
             let brightness = |p: usize| f64::from(evidence.appearances[p].brightness.max(0.002));
             let around = median(neighbours.iter().map(|p| brightness(*p)).collect());
@@ -142,7 +142,7 @@ pub(super) fn exposure(evidence: &Evidence, graph: &Graph) -> Vec<Diagnosis> {
     found
 }
 
-/// Photographs with little texture, or of which too little is not hidden.
+/// Photographs with little texture, or with most of their area hidden.
 pub(super) fn few_features(evidence: &Evidence, graph: &Graph) -> Vec<Diagnosis> {
     let counts: Vec<usize> = evidence.features.iter().map(|f| f.keypoints.len()).collect();
     let median = median(counts.iter().map(|c| *c as f64).collect()).unwrap_or(0.0);

@@ -1,10 +1,11 @@
-//! Matches that should be there and are not ([`crate::map::absent`]).
+//! Matches that should exist and do not ([`crate::map::absent`]).
 
 use super::motion::most_named;
 use super::{Diagnosis, Evidence};
 use crate::map::ABSENT_PAIRS;
 
-/// Photographs that share nothing with others from nearly the same place: in the model, or in the one from which its parts were taken apart.
+/// Photographs that share nothing with others from nearly the same place, in the model or in the folded model that was split into
+/// parts.
 pub(super) fn missing(evidence: &Evidence) -> Vec<Diagnosis> {
     if evidence.absent.len() < ABSENT_PAIRS {
         return Vec::new();

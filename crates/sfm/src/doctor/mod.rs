@@ -1,7 +1,7 @@
-//! The capture doctor: what is wrong with a set of photographs, in plain sentences with evidence.
+//! The capture doctor: the faults of a set of photographs, in plain sentences with evidence.
 //!
-//! [`diagnose`] looks at pixels, features, pairs and, if there is one, the model. Every diagnosis is a pure function in the file
-//! of its family; thresholds are constants beside it, measured by the example `doctor` on injured and on clean captures.
+//! [`diagnose`] examines pixels, features, pairs and, if there is one, the model. Every diagnosis is a pure function in the file
+//! of its family; thresholds are constants beside it, measured by the example `doctor` on damaged and on clean captures.
 
 mod appearance;
 mod folds;
@@ -27,12 +27,12 @@ use crate::map::{Absent, LeftOut, Model, PairKind, PhotoInfo, Reason, Source, St
 use crate::{Features, PairMatches, connected};
 use std::collections::BTreeMap;
 
-/// Everything that is known of a capture. All that is by photograph has the same order.
+/// Everything that is known about a capture. All lists by photograph have the same order.
 #[derive(Clone, Copy, Debug)]
 pub struct Evidence<'a> {
     /// `[photos]`
     pub photos: &'a [PhotoInfo],
-    /// `[photos]` figures of the pixels.
+    /// `[photos]` measurements of the pixels.
     pub appearances: &'a [Appearance],
     /// `[photos]`
     pub features: &'a [Features],
@@ -40,23 +40,23 @@ pub struct Evidence<'a> {
     pub colors: &'a [Vec<[u8; 3]>],
     /// Pairs before verification.
     pub matches: &'a [PairMatches],
-    /// What stood still before it was masked, if it was; `features` and `matches` have nothing of it.
+    /// What stood still before it was masked, if it was; `features` and `matches` are then without it.
     pub masked: Option<&'a StandsStill>,
-    /// Pairs after it.
+    /// Pairs after verification.
     pub pairs: &'a [VerifiedPair],
     /// `[groups]` the camera of each group before any adjustment, and where its focal length comes from.
     pub cameras: &'a [(DCamera, Source)],
     /// The models, largest first, if the photographs were mapped.
     pub models: &'a [Model],
-    /// What the mapper found of focal lengths that no metadata tell.
+    /// Focal lengths that are not in the metadata and that the mapper found.
     pub zooms: &'a [Zoom],
-    /// Whether the mapper made each photograph a camera of its own.
+    /// Whether the mapper gave each photograph its own camera.
     pub own_focals: bool,
     /// Photographs that should share points of a model and do not.
     pub absent: &'a [Absent],
-    /// Models of what the mapper took apart therefore, if it did.
+    /// Number of models into which the mapper split the first model because of absent pairs, if it did.
     pub apart: Option<usize>,
-    /// What became of photographs without a pose, if the photographs were mapped.
+    /// Photographs without a pose and the reasons, if the photographs were mapped.
     pub left_out: &'a [LeftOut],
 }
 
@@ -69,17 +69,18 @@ impl<'a> Evidence<'a> {
 
 /// The partners of each photograph.
 struct Graph {
-    /// `[photos]` partner and index of the pair, those with most matches first.
+    /// `[photos]` partner and index of the pair, most matches first.
     partners: Vec<Vec<(usize, usize)>>,
     /// `[photos]` the photographs on the same rig, or the photograph alone.
     rigs: Vec<Vec<usize>>,
 }
 
-/// Matches of a pair that holds photographs together. COLMAP accepts 15, of which chance alone reaches up to 20 among thousands of pairs.
+/// Minimum number of matches of a pair that connects photographs. COLMAP accepts 15, but among thousands of pairs chance alone reaches
+/// up to 20.
 const HOLDS: usize = 25;
 
 impl Graph {
-    /// Of the pairs with at least `matches` matches.
+    /// The graph of all pairs with at least `matches` matches.
     fn new(evidence: &Evidence, matches: usize) -> Self {
         let pairs = evidence.pairs;
         let mut partners = vec![Vec::new(); evidence.photos.len()];
@@ -99,7 +100,7 @@ impl Graph {
         Self { partners, rigs }
     }
 
-    /// Whether a photograph is on a rig: what is beside it there makes up for what it lacks.
+    /// Whether a photograph is on a rig, where the others on it make up for what it lacks.
     fn is_on_rig(&self, photo: usize) -> bool {
         self.rigs[photo].len() > 1
     }
@@ -116,10 +117,10 @@ impl Graph {
     }
 }
 
-/// All that is wrong with a capture, the gravest first.
+/// All faults of a capture, the most serious first.
 ///
 /// # Panics
-/// When lengths or indices of `evidence` do not fit together.
+/// When lengths or indices in `evidence` are inconsistent.
 pub fn diagnose(evidence: &Evidence) -> Vec<Diagnosis> {
     let n = evidence.photos.len();
     assert!(
@@ -184,7 +185,7 @@ pub fn diagnose(evidence: &Evidence) -> Vec<Diagnosis> {
     [left_out, known].concat()
 }
 
-/// One reason for each photograph without a pose: what the doctor found there, else what the mapper says.
+/// One reason for each photograph without a pose: the doctor's diagnosis if there is one, else the mapper's reason.
 fn left_out(evidence: &Evidence, known: &[Diagnosis]) -> Vec<Diagnosis> {
     let mut causes: BTreeMap<usize, String> = BTreeMap::new();
     for diagnosis in known {
@@ -198,12 +199,12 @@ fn left_out(evidence: &Evidence, known: &[Diagnosis]) -> Vec<Diagnosis> {
                 if *stops > 0.0 { "brighter" } else { "darker" }
             ),
             Diagnosis::Clipped { fraction, bright, .. } => format!(
-                "{:.0} % of it are {} without detail",
+                "{:.0} % of it is {} without detail",
                 100.0 * fraction,
                 if *bright { "white" } else { "black" }
             ),
             Diagnosis::FewFeatures { features, .. } => format!("only {features} features: it shows little texture"),
-            Diagnosis::Hidden { fraction, .. } => format!("{:.0} % of it are masked or transparent", 100.0 * fraction),
+            Diagnosis::Hidden { fraction, .. } => format!("{:.0} % of it is masked or transparent", 100.0 * fraction),
             Diagnosis::Zoom { ratio, .. } => format!("it has {ratio:.2} times the focal length of the others"),
             _ => continue,
         };
@@ -216,7 +217,7 @@ fn left_out(evidence: &Evidence, known: &[Diagnosis]) -> Vec<Diagnosis> {
         .iter()
         .map(|left| Diagnosis::LeftOut {
             photo: left.photo,
-            // A photograph from the same place as all its partners is good as a photograph.
+            // A photograph from the same place as all its partners may be fine in itself: the mapper's reason counts.
             reason: match (causes.get(&left.photo), left.reason) {
                 (_, Reason::RotationOnly { .. }) | (None, _) => left.reason.to_string(),
                 (Some(cause), _) => cause.clone(),
@@ -225,7 +226,7 @@ fn left_out(evidence: &Evidence, known: &[Diagnosis]) -> Vec<Diagnosis> {
         .collect()
 }
 
-/// The pair's kind is a turn on the spot.
+/// Whether the pair is a turn on the spot.
 fn turns_only(pair: &VerifiedPair) -> bool {
     pair.kind == PairKind::Rotation
 }

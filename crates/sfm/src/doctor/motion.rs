@@ -1,4 +1,4 @@
-//! What the motion between photographs tells: none, turns only, something that stands still.
+//! Diagnoses from the motion between photographs: none, rotation only, or something that stands still.
 
 use super::{Diagnosis, Evidence, Graph, HOLDS, turns_only};
 use crate::geometry::homography::turned;
@@ -6,14 +6,16 @@ use crate::map::{VerifiedPair, on_planes, same_place, stands_still};
 use crate::median;
 use std::collections::BTreeMap;
 
-/// Photographs of one place from which on it is a fault of the capture.
+/// Minimum number of photographs from one place for a fault of the capture.
 const TURNED: usize = 3;
-/// Of half of the strongest pairs between two models, a rotation explains this fraction of the matches with errors below so many pixels, if the camera only turned: of two flights of a drone
-/// through a hall, 0.84 to 0.95 where the models have no common scale, 0.1 and 0.2 where something else parts them.
+/// The camera only turned between two models if, in the median of the strongest pairs between them, a rotation explains at least this
+/// fraction of the matches with an error below this number of pixels. In two flights of a drone through a hall: 0.84 to 0.95 where
+/// the models have no common scale, 0.1 and 0.2 where something else separates them.
 const TURNS: f64 = 0.8;
 const TURN_ERROR: f64 = 4.0;
 
-/// Photographs all of whose pairs only turn. What moves across the picture seems to turn: pairs that are `moving` tell nothing.
+/// Photographs all of whose pairs only turn. Something that moves across the photographs looks like a turn, so `moving` pairs do not
+/// count.
 pub(super) fn rotation_only(evidence: &Evidence, graph: &Graph, moving: &[[u32; 2]]) -> Vec<Diagnosis> {
     let turns = |pair: &VerifiedPair| turns_only(pair) && !moving.contains(&pair.photos);
     let turned: Vec<usize> = (0..evidence.photos.len())
@@ -33,10 +35,11 @@ pub(super) fn rotation_only(evidence: &Evidence, graph: &Graph, moving: &[[u32; 
     vec![Diagnosis::RotationOnly { photos: turned, pairs }]
 }
 
-/// Models between which most of the strongest pairs, those with half of the matches of the first or more, only turn: nothing tells the scale of one in the other.
+/// Pairs of models between which most of the strongest pairs, those with at least half of the matches of the first, only turn: nothing
+/// determines the scale of one model relative to the other.
 pub(super) fn turn_only(evidence: &Evidence) -> Vec<Diagnosis> {
     if evidence.apart.is_some() {
-        // What looks alike is seen from alike places.
+        // Parts that look alike are photographed from similar viewpoints, so the wrong pairs between them look like turns.
         return Vec::new();
     }
     let model_of = |photo: u32| {
@@ -61,7 +64,7 @@ pub(super) fn turn_only(evidence: &Evidence) -> Vec<Diagnosis> {
         };
         let matches = on_planes(pair, evidence.features, [a, b]);
         let threshold = TURN_ERROR / b.focal();
-        // Wrong matches tilt the first rotation.
+        // Wrong matches bias the first rotation, so the first threshold is wide.
         turned(&matches, &[8.0 * threshold, 2.0 * threshold], threshold) as f64 / matches.len().max(1) as f64
     };
     let diagnosis = |(models, pairs): ([usize; 2], Vec<&VerifiedPair>)| {
@@ -78,7 +81,7 @@ pub(super) fn turn_only(evidence: &Evidence) -> Vec<Diagnosis> {
     between.into_iter().filter_map(diagnosis).collect()
 }
 
-/// Photographs by how many of `pairs` name them, most first.
+/// Photographs sorted by the number of `pairs` that they are in, most first.
 pub(super) fn most_named(pairs: &[[u32; 2]]) -> Vec<usize> {
     let mut counts: BTreeMap<usize, usize> = BTreeMap::new();
     for photo in pairs.iter().flatten() {
@@ -89,7 +92,8 @@ pub(super) fn most_named(pairs: &[[u32; 2]]) -> Vec<usize> {
     photos.into_iter().map(|p| p.0).collect()
 }
 
-/// A part of the pictures that stands still, and photographs that show the same from the same place: pairs on a turntable only seem to.
+/// A part of the photographs that stands still; otherwise, photographs of the same part of the scene from the same place, which pairs
+/// on a turntable only seem to be.
 pub(super) fn still(evidence: &Evidence) -> (Vec<Diagnosis>, Vec<Diagnosis>) {
     let &Evidence {
         photos,

@@ -1,9 +1,9 @@
-//! Something that follows a motion of its own.
+//! Something in the scene that moves.
 //!
-//! In many pairs, matches on a small part of the pictures agree with one plane, and not with the motion of the rest, which is spread over
-//! the pictures: the scene's. Which of the two was verified as the pair's motion does not matter. Wallpaper does the same, where a motif
-//! is taken for its copy, but seldom between photographs that share most, and a third photograph that shows both tells them apart: what
-//! moves is one thing everywhere.
+//! In many pairs, matches on a small part of the photographs agree with one plane, and not with the motion of the rest, which covers
+//! most of the photographs and is that of the scene. It does not matter which of the two was verified as the pair's motion. Wallpaper
+//! looks similar where a motif is mistaken for its copy, but seldom between photographs that share most, and a third photograph
+//! that shows both motifs tells them apart: a moving object is the same object in all three.
 
 use super::motion::most_named;
 use super::{Diagnosis, Evidence};
@@ -19,28 +19,28 @@ use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
-/// Partners of each photograph, those with most matches, with which it is compared.
+/// Number of partners with which each photograph is compared, those with most matches.
 const STRONGEST: usize = 5;
-/// Matches on what moves, and on the scene.
+/// Minimum number of matches on what moves, and on the scene.
 const MATCHES: usize = 12;
 const SCENE_MATCHES: usize = 15;
-/// Fraction of the other matches that are the scene.
+/// Minimum fraction of the other matches that are on the scene.
 const SCENE_FRACTION: f64 = 0.4;
-/// Planes of a pair that are tried.
+/// Number of planes that are tried for a pair.
 const PLANES: usize = 3;
-/// Median distance from the scene's epipolar lines of what moves, in long sides.
+/// Minimum median distance of what moves from the scene's epipolar lines, relative to the long side.
 const OFF: f64 = 0.012;
-/// Largest part of the long side, along each axis, of what moves.
+/// Maximum extent of what moves along each axis, relative to the long side.
 const PART: f64 = 0.5;
-/// Matches on what stands out whose lines of parallax are tried, fraction of the matches that one motion explains, and of the scene's,
-/// where it is parallax.
+/// A group in front of a plane is parallax: number of its matches whose lines of parallax are tried, and minimum fractions of the
+/// group's matches and of the scene's that one motion explains.
 const PARALLAX_LINES: usize = 20;
 const EXPLAINED: f64 = 0.5;
 const AS_MANY: f64 = 0.9;
-/// Fraction of the third photographs that must show one thing.
+/// Minimum fraction of matches in third photographs that confirm a single object.
 const ONE_THING: f64 = 0.8;
-/// Pairs, and their fraction, from which on something moves. Four captures with a moving board reach 0.22 to 0.76, clean ones 0.1 (before
-/// wallpaper), the others less.
+/// Minimum number of pairs, and minimum fraction of the compared ones, for a diagnosis. Four captures with a moving board reach 0.22
+/// to 0.76, clean ones 0.1 (in front of wallpaper) or less.
 const PAIRS: usize = 4;
 const FRACTION: f64 = 0.15;
 
@@ -74,7 +74,7 @@ pub(super) fn moving(evidence: &Evidence) -> (Vec<Diagnosis>, Vec<[u32; 2]>) {
     (vec![diagnosis], found)
 }
 
-/// Each photograph's pairs with most matches, in their order.
+/// The pairs with most matches of each photograph, most matches first.
 fn strongest<'a>(evidence: &Evidence<'a>) -> Vec<&'a PairMatches> {
     let mut order: Vec<&PairMatches> = evidence.matches.iter().collect();
     order.retain(|pair| pair.matches.len() >= MATCHES + SCENE_MATCHES);
@@ -88,7 +88,7 @@ fn strongest<'a>(evidence: &Evidence<'a>) -> Vec<&'a PairMatches> {
     order
 }
 
-/// Matches on something compact that agree with one another and not with the scene.
+/// Matches on a compact object that agree with one another and not with the scene.
 fn own_motion(evidence: &Evidence, pair: &PairMatches) -> Option<Vec<[u32; 2]>> {
     let places = centered_points(evidence.photos, evidence.features, pair);
     let mut rest: Vec<Match> = pair.matches.iter().copied().zip(places).collect();
@@ -107,7 +107,7 @@ fn own_motion(evidence: &Evidence, pair: &PairMatches) -> Option<Vec<[u32; 2]>> 
     None
 }
 
-/// Whether `group` disagrees with the motion of `scene`, if that has one and is spread over the pictures.
+/// Whether `group` disagrees with the motion of `scene`, provided that `scene` has one and it covers most of the photographs.
 fn is_off(pair: &PairMatches, group: &[Match], scene: &[Match]) -> bool {
     let points = Correspondences::new(scene.iter().map(|m| m.1).collect());
     let problem = Fundamental {
@@ -127,9 +127,9 @@ fn is_off(pair: &PairMatches, group: &[Match], scene: &[Match]) -> bool {
         && !is_parallax(pair, group, scene, spread.len())
 }
 
-/// Whether another motion explains `group` and nearly as many matches of `scene` as the one that explains `agreeing` of them. It does where
-/// the scene is one plane, which leaves the motion open: what stands before that plane then shows parallax (Hartley and Zisserman 2004,
-/// 13.3).
+/// Whether another motion explains `group` and nearly as many matches of `scene` as the one that explains `agreeing` of them. That is
+/// so where the scene is one plane, which does not determine the motion: what is in front of that plane then shows parallax (Hartley
+/// and Zisserman 2004, 13.3).
 fn is_parallax(pair: &PairMatches, group: &[Match], scene: &[Match], agreeing: usize) -> bool {
     let points = Correspondences::new(scene.iter().map(|m| m.1).collect());
     let problem = Homography {
@@ -161,7 +161,7 @@ fn keypoints(matches: Vec<Match>) -> Vec<[u32; 2]> {
     matches.into_iter().map(|m| m.0).collect()
 }
 
-/// The matches that agree with one plane, and the others; `None` if the first are few.
+/// The matches that agree with one plane, and the others; `None` if too few agree.
 fn plane(pair: &PairMatches, matches: Vec<Match>) -> Option<(Vec<Match>, Vec<Match>)> {
     if matches.len() < MATCHES {
         return None;
@@ -180,12 +180,12 @@ fn plane(pair: &PairMatches, matches: Vec<Match>) -> Option<(Vec<Match>, Vec<Mat
     (group.len() >= MATCHES).then_some((group, left))
 }
 
-/// Whether matches cover a small part of both pictures, but more than a point.
+/// Whether matches cover a small part of both photographs, but more than a point.
 fn is_compact(matches: &[Match]) -> bool {
     let within = |side: usize, axis: usize| {
         let mut values: Vec<f64> = matches.iter().map(|m| m.1[side][axis]).collect();
         values.sort_by(f64::total_cmp);
-        // A tenth on either side may be chance.
+        // Up to a tenth on either side may be outliers.
         let cut = values.len() / 10;
         let width = values[values.len() - 1 - cut] - values[cut];
         (0.005..PART).contains(&width)
@@ -213,7 +213,7 @@ fn partners(evidence: &Evidence) -> Partners {
     partners
 }
 
-/// Whether third photographs with a match on either side of these matches have it at the same keypoint.
+/// Whether third photographs that match both keypoints of these matches do so at the same keypoint.
 fn is_one_thing(partners: &Partners, [a, b]: [u32; 2], matches: &[[u32; 2]]) -> bool {
     let (mut same, mut both) = (0, 0);
     for [i, j] in matches {

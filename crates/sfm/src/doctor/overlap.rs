@@ -2,14 +2,14 @@
 
 use super::{Diagnosis, Evidence, Graph};
 
-/// Partners below which a photograph hangs loosely.
+/// Minimum number of partners for a photograph to be well connected.
 const PARTNERS: usize = 3;
-/// Photographs from which on a capture can be expected to overlap more than once.
+/// Minimum number of photographs of a capture whose photographs can be expected to overlap more than once.
 const CAPTURE: usize = 6;
-/// Photographs of a part that is worth a bridge: fewer are photographs with few partners.
+/// Minimum number of photographs of a part: fewer are reported as photographs with few partners.
 const PART: usize = 3;
 
-/// All about the graph of overlap.
+/// All diagnoses about the graph of overlap.
 pub(super) fn overlap(evidence: &Evidence, graph: &Graph) -> Vec<Diagnosis> {
     let mut found = Vec::new();
     let n = evidence.photos.len();
@@ -23,7 +23,7 @@ pub(super) fn overlap(evidence: &Evidence, graph: &Graph) -> Vec<Diagnosis> {
     if n < CAPTURE {
         return found;
     }
-    // Panoramas are linked by one another's faces, whose pairs alone would be bridges.
+    // The faces of panoramas link the panoramas, so single pairs of faces would look like bridges.
     if !(0..n).any(|photo| graph.is_on_rig(photo)) {
         found.extend(weak_links(graph));
     }
@@ -74,7 +74,7 @@ fn weak_links(graph: &Graph) -> Vec<Diagnosis> {
             }
         });
     }
-    // The ends of a bridge are cut points too, and the root of the search once for each of its branches.
+    // The ends of a bridge are cut points too, and the root of the search is one for each of its branches.
     let mut named: Vec<usize> = found
         .iter()
         .filter(|d| matches!(d, Diagnosis::Bridge { .. }))
@@ -94,18 +94,18 @@ fn weak_links(graph: &Graph) -> Vec<Diagnosis> {
 /// Depth-first search.
 struct Search<'a> {
     graph: &'a Graph,
-    /// `[photos]` when each was reached.
+    /// `[photos]` position of each in the order in which they were reached.
     order: Vec<usize>,
-    /// `[photos]` the earliest that each and those below it lead to.
+    /// `[photos]` the earliest photograph that each and those below it lead to.
     low: Vec<usize>,
-    /// `[photos]` photographs below each, and itself.
+    /// `[photos]` number of photographs below each, including itself.
     below: Vec<usize>,
     /// Photographs in the order in which they were reached.
     members: Vec<usize>,
 }
 
 impl Search<'_> {
-    /// Calls `done(search, parent, child)` when all below `child` is known.
+    /// Calls `done(search, parent, child)` when everything below `child` has been visited.
     fn visit(&mut self, root: usize, done: &mut dyn FnMut(&Self, usize, usize)) {
         // The photograph, its parent, and its next partner.
         let mut stack = vec![(root, usize::MAX, 0)];

@@ -1,21 +1,21 @@
-//! Captures that go around something, or look around: gaps, and ends that do not meet.
+//! Captures that go around an object, or look around: gaps, and ends that do not meet.
 
 use super::{Diagnosis, Evidence, Graph};
 use crate::upright::up;
 use glam::{DQuat, DVec3};
 
-/// Photographs from which on a capture can be a ring.
+/// Minimum number of photographs for a capture to be a ring.
 const RING: usize = 10;
-/// A gap wider than this, degrees, is where the capture ends: a wall behind the subject.
+/// A gap wider than this, degrees, is where the capture ends, for example at a wall behind the subject.
 const OPEN: f64 = 120.0;
-/// The narrowest gap, degrees, and in medians of the spacing.
+/// Width of the narrowest gap, in degrees and in medians of the spacing.
 const GAP: f64 = 18.0;
 const SPACINGS: f64 = 3.0;
 /// Gaps up to this width, degrees, leave a loop open; wider ones are gaps. Features match over up to 30 degrees.
 const LOOP: f64 = 45.0;
-/// Photographs on both sides of a gap, degrees from its edge, that would match over it.
+/// Photographs on both sides of a gap are expected to match across it up to this angle from its edges, degrees.
 const SIDE: f64 = 30.0;
-/// Horizontal part of a viewing direction that tells an azimuth.
+/// Minimum horizontal part of a viewing direction for its azimuth to be usable.
 const LEVEL: f64 = 0.3;
 
 /// Gaps between neighbouring viewing directions that no pair of photographs spans. Without a model, `turns` holds the rotation from
@@ -52,7 +52,7 @@ pub(super) fn ring(evidence: &Evidence, graph: &Graph, turns: &[Option<DQuat>]) 
         .collect()
 }
 
-/// Whether photographs on both sides of the gap after `seen[i]` match.
+/// Whether photographs on both sides of the gap after `seen[i]` match each other.
 fn is_spanned(seen: &[(f64, usize)], graph: &Graph, i: usize) -> bool {
     let n = seen.len();
     let (before, after) = (seen[i].0, seen[(i + 1) % n].0);
@@ -84,7 +84,7 @@ fn azimuths(evidence: &Evidence, graph: &Graph, turns: &[Option<DQuat>]) -> Vec<
     let level = DQuat::from_rotation_arc(up, DVec3::Z);
     let mut seen: Vec<(f64, usize)> = rotations
         .into_iter()
-        // Faces of panoramas look everywhere.
+        // Faces of panoramas look in all directions.
         .filter(|(photo, _)| !graph.is_on_rig(*photo))
         .filter_map(|(photo, rotation)| {
             let forward = level * (rotation * DVec3::Z);

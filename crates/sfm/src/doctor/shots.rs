@@ -1,27 +1,27 @@
-//! Where to stand to mend a capture.
+//! Poses of further photographs that would repair a capture.
 
 use super::Diagnosis;
 use crate::geometry::pose::DPose;
 use crate::map::Model;
 use glam::{DQuat, DVec3};
 
-/// Degrees between photographs around a scene that match well.
+/// Angle between neighbouring photographs around a scene at which they match well, degrees.
 const STEP: f64 = 15.0;
-/// Photographs at most for one fault.
+/// Maximum number of photographs for one fault.
 const MOST: usize = 8;
-/// Degrees, seen from the middle of the model, from which on the way between two cameras is an arc around it.
+/// Minimum angle between two cameras, seen from the centre of the model, at which the path between them is an arc around it, degrees.
 const ARC: f64 = 10.0;
 
-/// A place for a photograph.
+/// The pose of a photograph to be taken.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Shot {
-    /// World of the model.
+    /// In the model's world.
     pub position: DVec3,
     /// Unit viewing direction, world.
     pub forward: DVec3,
 }
 
-/// Photographs that would mend a fault between two posed photographs, from one to the other; none for other faults.
+/// Photographs that would repair a fault between two posed photographs, from one to the other; none for other faults.
 pub fn shots(diagnosis: &Diagnosis, model: &Model) -> Vec<Shot> {
     let ([a, b], least) = match diagnosis {
         Diagnosis::Gap { sides: ends, .. } | Diagnosis::OpenLoop { ends, .. } => (*ends, 1),
@@ -38,7 +38,7 @@ pub fn shots(diagnosis: &Diagnosis, model: &Model) -> Vec<Shot> {
     }
 }
 
-/// Poses between two, around the vertical axis through the middle of the model where both are on different sides of it.
+/// Poses between two, on an arc around the vertical axis through the centre of the model where both are on different sides of it.
 fn between(a: &DPose, b: &DPose, least: usize) -> Vec<Shot> {
     let azimuth = |p: DVec3| p.y.atan2(p.x);
     let turn = (azimuth(b.position) - azimuth(a.position) + std::f64::consts::PI).rem_euclid(std::f64::consts::TAU)

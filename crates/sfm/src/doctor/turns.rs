@@ -6,31 +6,32 @@ use crate::map::{PairKind, VerifiedPair};
 use glam::{DQuat, DVec4};
 use std::collections::BTreeMap;
 
-/// Matches of a pair beyond which it weighs no more.
+/// Number of matches beyond which the weight of a pair stays constant.
 const FULL_WEIGHT: usize = 150;
-/// Largest angle of a loop of three pairs that agree, radians: the error of two-view rotations with a guessed focal length
-/// (Zach, Klopschitz and Pollefeys, "Disambiguating visual relations using loop constraints", 2010, allow 2 to 5 degrees a pair).
+/// Maximum angle of a loop of three pairs that agree, radians: the error of two-view rotations with a guessed focal length
+/// (Zach, Klopschitz and Pollefeys, "Disambiguating visual relations using loop constraints", 2010, allow 2 to 5 degrees per pair).
 const CLOSED: f64 = 0.17;
-/// Scales of the robust weight while the rotations settle, radians.
+/// Successive scales of the robust weight, radians.
 const SCALES: [f64; 4] = [0.5, 0.25, 0.12, 0.08];
 /// Sweeps over all photographs for each scale.
 const SWEEPS: usize = 40;
 /// Weight of a pair that shows a plane: two rotations fit it.
 const PLANAR: f64 = 0.2;
 
-/// Rotations from pairs alone.
+/// Rotations of all photographs, estimated from pairs alone.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Turns {
     /// `[photos]` rotation from the camera to the world of its part; `None` without a pair.
     pub world_from_camera: Vec<Option<DQuat>>,
-    /// `[photos]` the number of the part that hangs together.
+    /// `[photos]` the number of the connected part that each photograph is in.
     pub part: Vec<usize>,
-    /// `[pairs]` by how much each pair disagrees with them, radians.
+    /// `[pairs]` angle between the rotation of each pair and the one that these rotations predict, radians.
     pub disagreement: Vec<f64>,
 }
 
-/// The rotations that agree best with those of `pairs`, `rotations` from the first camera to the second of each: first along the tree of the best pairs, then as robust means (Hartley et
-/// al., "Rotation averaging", 2013, with Geman and McClure's weight).
+/// The rotations that agree best with those of `pairs`, where `rotations` holds the rotation from the first camera to the second of
+/// each pair: first along the spanning tree of the best pairs, then as robust means (Hartley et al., "Rotation averaging", 2013, with
+/// Geman and McClure's weight).
 pub fn turns(photos: usize, pairs: &[VerifiedPair], rotations: &[DQuat]) -> Turns {
     let said = rotations;
     let closed = closed_loops(photos, pairs, said);
@@ -40,7 +41,7 @@ pub fn turns(photos: usize, pairs: &[VerifiedPair], rotations: &[DQuat]) -> Turn
     };
     let weights: Vec<f64> = (0..pairs.len()).map(weight).collect();
     let mut order: Vec<usize> = (0..pairs.len()).collect();
-    // Beyond the full weight, more matches still are the better branch.
+    // Beyond the full weight, a branch with more matches is still the better one.
     let branch = |i: usize| weights[i] * (pairs[i].matches.len() as f64).sqrt();
     order.sort_by(|a, b| branch(*b).total_cmp(&branch(*a)).then(a.cmp(b)));
     let mut partners: Vec<Vec<(usize, DQuat, f64)>> = vec![Vec::new(); photos];
@@ -89,7 +90,7 @@ fn angle(a: DQuat, b: DQuat) -> f64 {
     2.0 * a.dot(b).abs().min(1.0).acos()
 }
 
-/// `[pairs]` the fraction of the loops of three through each pair that close, in \[0, 1\]; half without any loop.
+/// `[pairs]` the weighted fraction, in \[0, 1\], of the loops of three pairs through each pair that close; 0.5 without any loop.
 fn closed_loops(photos: usize, pairs: &[VerifiedPair], said: &[DQuat]) -> Vec<f64> {
     let mut of: Vec<BTreeMap<usize, usize>> = vec![BTreeMap::new(); photos];
     for (i, pair) in pairs.iter().enumerate() {
@@ -116,7 +117,7 @@ fn closed_loops(photos: usize, pairs: &[VerifiedPair], said: &[DQuat]) -> Vec<f6
         .collect()
 }
 
-/// Rotations along the tree of the first pairs of `order` that join parts; and each photograph's part.
+/// Rotations along the spanning tree of the first pairs of `order` that join two parts, and each photograph's part.
 fn along_tree(
     photos: usize,
     pairs: &[VerifiedPair],
@@ -166,7 +167,7 @@ mod tests {
         pairs.iter().map(|pair| pair.motion.rotation).collect()
     }
 
-    /// A ring of `n` cameras of which each is paired with the next `reach`.
+    /// A ring of `n` cameras, each paired with the next `reach` cameras.
     fn ring(n: usize, reach: usize) -> (Vec<DQuat>, Vec<VerifiedPair>) {
         let camera = |i: usize| {
             DQuat::from_rotation_y(std::f64::consts::TAU * i as f64 / n as f64) * DQuat::from_rotation_x(0.3)
@@ -202,7 +203,7 @@ mod tests {
         let genuine = pairs.len();
         for i in 0..12 {
             for j in [i + 11, i + 12] {
-                // The far side taken for the near one.
+                // The far side is mistaken for the near one.
                 let twin = cameras[(j + 12) % 24];
                 pairs.push(pair(i, j, twin.inverse() * cameras[i], 60));
             }

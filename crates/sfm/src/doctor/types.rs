@@ -1,12 +1,12 @@
-//! What the doctor can find, one variant a diagnosis, each with its evidence and one sentence.
+//! The doctor's diagnoses: one variant for each, with its evidence and one sentence.
 
 use super::looks::FEATURES_BY_MEDIAN;
 use std::fmt::{self, Display, Formatter};
 
-/// Fraction of the matches that stands still, from which on the camera itself may: people walk before one on a tripod with 98 %.
+/// Minimum fraction of matches at rest for the camera itself to be at rest: people who walk in front of a camera on a tripod leave 98 %.
 const CAMERA_AT_REST: f64 = 0.9;
 
-/// The family of a diagnosis, by which tests and reports count them.
+/// The family of a diagnosis; tests and reports count diagnoses by family.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Kind {
     /// [`Diagnosis::Blurred`]
@@ -79,7 +79,7 @@ impl Kind {
 /// A fault of a capture, with its evidence. Photographs are indices.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Diagnosis {
-    /// Less sharp than those that show the same.
+    /// Less sharp than photographs of the same part of the scene.
     Blurred {
         /// The photograph.
         photo: usize,
@@ -88,7 +88,7 @@ pub enum Diagnosis {
         /// Those neighbours.
         neighbours: Vec<usize>,
     },
-    /// Brighter or darker than those that show the same.
+    /// Brighter or darker than photographs of the same part of the scene.
     ExposureJump {
         /// The photograph.
         photo: usize,
@@ -97,7 +97,7 @@ pub enum Diagnosis {
         /// Those neighbours.
         neighbours: Vec<usize>,
     },
-    /// Much of it is white or black, unlike the others.
+    /// A large part is white or black, unlike in the others.
     Clipped {
         /// The photograph.
         photo: usize,
@@ -112,10 +112,10 @@ pub enum Diagnosis {
         photo: usize,
         /// Its features.
         features: usize,
-        /// Those of half of the photographs.
+        /// The median over all photographs.
         median: usize,
     },
-    /// Hidden by its mask, or transparent, but for too little.
+    /// Hidden by its mask, or transparent, except for too small a part.
     Hidden {
         /// The photograph.
         photo: usize,
@@ -126,29 +126,29 @@ pub enum Diagnosis {
     Zoom {
         /// The photographs of one focal length.
         photos: Vec<usize>,
-        /// That focal length by the one of the others.
+        /// That focal length relative to the one of the others.
         ratio: f64,
     },
-    /// The focal lengths differ from photograph to photograph, and no metadata tell.
+    /// The focal length differs from photograph to photograph and is not in the metadata.
     OwnFocals {
-        /// The photographs of the shortest and of the longest.
+        /// The photographs with the shortest and the longest focal length.
         ends: [usize; 2],
-        /// The longest by the shortest.
+        /// The longest relative to the shortest.
         ratio: f64,
     },
-    /// The metadata name several focal lengths.
+    /// The metadata have several focal lengths.
     ZoomSettings {
-        /// Focal lengths in long sides, each with its photographs.
+        /// Focal lengths, relative to the long side, each with its photographs.
         settings: Vec<(f64, Vec<usize>)>,
     },
-    /// The principal point is away from the middle.
+    /// The principal point is away from the centre.
     Cut {
         /// The photographs, those with the largest distance first.
         photos: Vec<usize>,
         /// The largest distance, px.
         distance: f64,
     },
-    /// The matches fit all focal lengths alike.
+    /// All focal lengths fit the matches equally well.
     FocalUnknown {
         /// Photographs of the camera.
         photos: Vec<usize>,
@@ -158,14 +158,14 @@ pub enum Diagnosis {
         /// Photographs by part, largest first.
         parts: Vec<Vec<usize>>,
     },
-    /// Two parts are held together by one pair of photographs.
+    /// Two parts are connected by a single pair of photographs.
     Bridge {
         /// The pair.
         photos: [usize; 2],
         /// Photographs on each side.
         sides: [usize; 2],
     },
-    /// Two parts are held together by one photograph.
+    /// Two parts are connected by a single photograph.
     CutPoint {
         /// The photograph.
         photo: usize,
@@ -183,10 +183,10 @@ pub enum Diagnosis {
     Gap {
         /// The photographs on both sides.
         sides: [usize; 2],
-        /// Its width as seen from the middle, degrees.
+        /// Its angle as seen from the centre, degrees.
         degrees: f64,
     },
-    /// A chain of photographs around the scene whose ends do not meet.
+    /// A loop of photographs around the scene whose ends do not overlap.
     OpenLoop {
         /// Both ends.
         ends: [usize; 2],
@@ -200,20 +200,20 @@ pub enum Diagnosis {
         /// Pairs among them.
         pairs: usize,
     },
-    /// Two models see the same, but from one place.
+    /// Two models show the same part of the scene, but from one place.
     TurnOnly {
-        /// The photographs of either that share most.
+        /// The photographs, one of each model, with most matches.
         ends: [usize; 2],
-        /// Photographs of the models.
+        /// Number of photographs of each model.
         sides: [usize; 2],
     },
-    /// A part of the pictures stands still while the rest moves.
+    /// A part of the photographs stands still while the rest moves.
     StandsStill {
         /// Photographs of such pairs.
         photos: Vec<usize>,
-        /// Such pairs, and all that were compared.
+        /// Number of such pairs, and of all pairs that were compared.
         pairs: [usize; 2],
-        /// Median fraction of the matches that stands still.
+        /// Median fraction of the matches that stand still.
         fraction: f64,
         /// Whether it has been masked.
         masked: bool,
@@ -222,43 +222,43 @@ pub enum Diagnosis {
     Moving {
         /// Photographs of such pairs.
         photos: Vec<usize>,
-        /// Such pairs, and all that were compared.
+        /// Number of such pairs, and of all pairs that were compared.
         pairs: [usize; 2],
-        /// Median matches on what moved.
+        /// Median number of matches on what moved.
         matches: usize,
     },
-    /// Two photographs of the same from the same place.
+    /// Two photographs of the same part of the scene from the same place.
     Twice {
         /// The photographs.
         photos: [usize; 2],
     },
-    /// Pairs that cannot all be right: repeated structures look like one.
+    /// Pairs that cannot all be right: repeated structures are mistaken for one.
     Contradiction {
-        /// The pairs that contradict the rest, those with most matches first.
+        /// The pairs that contradict the rest, most matches first.
         pairs: Vec<[usize; 2]>,
         /// Matches of the first.
         matches: usize,
         /// The fraction of them that agrees with the rest.
         agree: f64,
-        /// Verified pairs in all.
+        /// Number of verified pairs whose photographs are in the model.
         of: usize,
     },
-    /// Photographs that share nothing with others from nearly the same place.
+    /// Photographs without a match to others from nearly the same place.
     Missing {
-        /// The pair with most points that should be matched.
+        /// The pair with the most points that should be matched.
         first: [usize; 2],
-        /// The photographs of all such pairs, those in most of them first.
+        /// The photographs of all such pairs, those in the most pairs first.
         photos: Vec<usize>,
-        /// The points that should be matched in the first.
+        /// Number of points that should be matched in the first pair.
         expected: usize,
-        /// Models of the parts that look alike; 1 if they are in one.
+        /// Number of models of the parts that look alike; 1 if they are in one model.
         models: usize,
     },
     /// A photograph without a pose.
     LeftOut {
         /// The photograph.
         photo: usize,
-        /// The one reason.
+        /// The reason.
         reason: String,
     },
 }
@@ -318,7 +318,7 @@ impl Diagnosis {
         }
     }
 
-    /// Two photographs, one of each side, that show what is wrong; the second is missing where there is one side only.
+    /// Two photographs, one of each side, that show what is wrong; the second is `None` where there is only one side.
     pub fn sides(&self) -> (usize, Option<usize>) {
         match self {
             Diagnosis::Blurred { photo, neighbours, .. } | Diagnosis::ExposureJump { photo, neighbours, .. } => {
@@ -336,7 +336,7 @@ impl Diagnosis {
         }
     }
 
-    /// One sentence, with the photographs' `names`.
+    /// The diagnosis as one sentence; `names` are those of all photographs.
     pub fn sentence<'a>(&'a self, names: &'a [String]) -> impl Display + 'a {
         Sentence { diagnosis: self, names }
     }
@@ -397,7 +397,7 @@ impl Display for Sentence<'_> {
                 bright,
             } => write!(
                 f,
-                "{:.0} % of {} are {} without detail, far more than in the others; expose it as them",
+                "{:.0} % of {} is {} without detail, far more than in the others; expose it like them",
                 100.0 * fraction,
                 name(photo),
                 if *bright { "white" } else { "black" }
@@ -408,7 +408,7 @@ impl Display for Sentence<'_> {
                 median,
             } => {
                 write!(f, "{} has {features} features", name(photo))?;
-                // Where most have few, the others are no measure.
+                // Where most photographs have few features, there is nothing to compare with.
                 if (*features as f64) < FEATURES_BY_MEDIAN * *median as f64 {
                     write!(f, " where half of the photographs have {median} or more")?;
                 }
@@ -416,7 +416,7 @@ impl Display for Sentence<'_> {
             }
             Diagnosis::Hidden { photo, fraction } => write!(
                 f,
-                "{:.0} % of {} are masked or transparent: white parts of a mask count, black ones are hidden",
+                "{:.0} % of {} is masked or transparent: white parts of a mask count, black ones are hidden",
                 100.0 * fraction,
                 name(photo)
             ),
@@ -431,8 +431,8 @@ impl Display for Sentence<'_> {
                 ratio,
             } => write!(
                 f,
-                "each photograph has a focal length of its own that no metadata tell, {} {ratio:.2} times that of {}: each became a \
-                 camera of its own; do not zoom, and take the pictures as the camera wrote them",
+                "each photograph has its own focal length, which the metadata do not state ({} has {ratio:.2} times that of {}), and \
+                 became its own camera; do not zoom, and use the photographs as the camera wrote them",
                 name(long),
                 name(short)
             ),
@@ -449,14 +449,14 @@ impl Display for Sentence<'_> {
             }
             Diagnosis::Cut { photos, distance } => write!(
                 f,
-                "the lens looks up to {distance:.0} px beside the middle of {}, as of pictures cut out of larger ones; give them as the \
-                 camera took them",
+                "the principal point is up to {distance:.0} px off the centre of {}, as in photographs cropped from larger ones; use them \
+                 as the camera took them",
                 self.list(photos)
             ),
             Diagnosis::FocalUnknown { photos } => write!(
                 f,
                 "the focal length of {} is a guess: all values fit, as for a plane or for turns on the spot; take some from nearer, \
-                 farther and aside",
+                 from farther away and from the side",
                 self.list(photos)
             ),
             Diagnosis::SeparateParts { parts } => write!(
@@ -469,7 +469,7 @@ impl Display for Sentence<'_> {
             ),
             Diagnosis::Bridge { photos: [a, b], sides } => write!(
                 f,
-                "only {} and {} hold {} and {} photographs together; take more between them",
+                "only {} and {} connect {} photographs with {} others; take more between them",
                 name(a),
                 name(b),
                 sides[0],
@@ -477,7 +477,7 @@ impl Display for Sentence<'_> {
             ),
             Diagnosis::CutPoint { photo, behind } => write!(
                 f,
-                "without {} nothing would hold {} and the rest together; take more around it",
+                "only {} connects {} with the rest; take more around it",
                 name(photo),
                 self.list(behind)
             ),
@@ -500,19 +500,20 @@ impl Display for Sentence<'_> {
             ),
             Diagnosis::OpenLoop { ends: [a, b], degrees } => write!(
                 f,
-                "the way around the scene is not closed: {} and {}, {degrees:.0} degrees apart, have no matches; take photographs between them",
+                "the loop around the scene is not closed: {} and {}, {degrees:.0} degrees apart, do not match; take photographs \
+                 between them",
                 name(a),
                 name(b)
             ),
             Diagnosis::RotationOnly { photos, pairs } => write!(
                 f,
-                "{} were taken from one place ({pairs} pairs only turn); step aside between photographs",
+                "{} were taken from one place ({pairs} pairs only turn); move sideways between photographs",
                 self.list(photos)
             ),
             Diagnosis::TurnOnly { ends: [a, b], sides } => write!(
                 f,
-                "between {} and {} the camera only turned, so that the {} and {} photographs on either side have a model each; step \
-                 aside while turning there",
+                "between {} and {} the camera only turned, so the {} and {} photographs on either side are separate models; move \
+                 sideways while turning there",
                 self.names[*a], self.names[*b], sides[0], sides[1]
             ),
             Diagnosis::StandsStill {
@@ -522,8 +523,8 @@ impl Display for Sentence<'_> {
                 masked,
             } => write!(
                 f,
-                "{:.0} % of the matches stand still while the rest moves, in {} of {} pairs, such as {}: {}a turntable before a fixed \
-                 background, what carries the camera, or writing on the pictures; {}",
+                "{:.0} % of the matches stand still while the rest moves, in {} of {} pairs, such as {}: {}a turntable in front of a \
+                 fixed background, whatever carries the camera, or text laid over the photographs; {}",
                 100.0 * fraction,
                 pairs[0],
                 pairs[1],
@@ -537,7 +538,8 @@ impl Display for Sentence<'_> {
             ),
             Diagnosis::Moving { photos, pairs, matches } => write!(
                 f,
-                "something moves: {matches} matches follow a motion of their own in {} of {} pairs, among {}; mask it, or poses may follow it",
+                "something moves: {matches} matches follow a motion of their own in {} of {} pairs, among {}; mask it, or poses may \
+                 follow it",
                 pairs[0],
                 pairs[1],
                 self.list(photos)
@@ -556,7 +558,7 @@ impl Display for Sentence<'_> {
             } => write!(
                 f,
                 "{} of {of} pairs contradict the others, such as {} and {}, where {:.0} % of {matches} matches agree with them: parts \
-                 that look alike may be taken for one another, and the model may be folded; include what tells them apart",
+                 that look alike may be mistaken for one another, and the model may be folded; include what tells them apart",
                 pairs.len(),
                 name(&pairs[0][0]),
                 name(&pairs[0][1]),
@@ -569,9 +571,9 @@ impl Display for Sentence<'_> {
                 models: 1,
             } => write!(
                 f,
-                "{} photographs share nothing with others from nearly the same place, such as {} and {}, with {expected} points that should be \
-                 in both: parts that look alike are taken for one and the model is folded, or a thing was moved between them; pose them apart, \
-                 or mask what stayed",
+                "{} photographs share nothing with others from nearly the same place, such as {} and {}, which should have {expected} \
+                 points in common: either parts that look alike are mistaken for one and the model is folded, or an object was moved \
+                 between the photographs; pose them separately, or mask what stayed in place",
                 photos.len(),
                 name(a),
                 name(b)
@@ -583,8 +585,9 @@ impl Display for Sentence<'_> {
                 models,
             } => write!(
                 f,
-                "{} photographs such as {} and {} would have been from nearly the same place and share nothing, with {expected} points that \
-                 should be in both: parts that look alike are {models} models now; take photographs that lead from one to the other",
+                "{} photographs, such as {} and {}, were posed at nearly the same place but share nothing, although they should have \
+                 {expected} points in common: parts that look alike are now {models} models; take photographs that lead from one to \
+                 the other",
                 photos.len(),
                 name(a),
                 name(b)

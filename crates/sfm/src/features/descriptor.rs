@@ -1,4 +1,4 @@
-//! Descriptors: histograms of gradients on a rotated grid of 4 x 4 cells (Lowe 2004, 6; details as in VLFeat), as RootSIFT.
+//! RootSIFT descriptors: histograms of gradients on a rotated grid of 4 x 4 cells (Lowe 2004, 6; details as in VLFeat).
 
 use super::extrema::Extremum;
 use super::gradients::{exp_minus, polar, rows_around};
@@ -10,23 +10,23 @@ use std::f32::consts::TAU;
 
 /// Cells along a side.
 const CELLS: usize = 4;
-/// Directions of a cell.
+/// Direction bins of a cell.
 const DIRECTIONS: usize = 8;
 /// Side of a cell, in sigmas of the extremum.
 const CELL: f32 = 3.0;
-/// Half of the side of the square whose pixels reach any cell, in cells.
+/// Half the side of the square of pixels that contribute to some cell, in cells.
 const REACH: f32 = 0.5 * (CELLS as f32 + 1.0);
-/// The largest entry of the normalised histogram, against highlights.
+/// Maximum entry of the normalised histogram, which limits the influence of highlights.
 const CLAMP: f32 = 0.2;
-/// Pixels across the square of the largest extremum, and a vector.
+/// Pixels across the square of the largest extremum, plus the length of a vector.
 const ACROSS: usize = 128;
 
-/// Cells with a margin of one on each side, so that pixels at the border need no test.
+/// Cells along a side with a margin of one cell on both sides, so that pixels at the border need no test.
 const MARGINED: usize = CELLS + 2;
-/// Directions of a margined cell: the last is the first again.
+/// Direction bins of a cell with margin: the last bin repeats the first.
 const WRAPPED: usize = DIRECTIONS + 1;
 
-/// The descriptor at `extremum` turned by `angle`, `[row][column][direction]`; `None` where the photograph is flat.
+/// The descriptor at `extremum`, rotated by `angle`, `[row][column][direction]`; `None` where the photograph is flat.
 pub(super) fn describe(level: Level, plane: &Plane, extremum: &Extremum, angle: f32) -> Option<[u8; DESCRIPTOR_BYTES]> {
     let bins = level.run(Histograms { plane, extremum, angle });
     let mut values = [0.0f32; DESCRIPTOR_BYTES];
@@ -60,7 +60,7 @@ impl Kernel for Histograms<'_> {
         let cell = CELL * extremum.sigma;
         let reach = REACH * cell;
         let (sin, cos) = angle.sin_cos();
-        // Half of the upright square around the turned one.
+        // Half the side of the upright square around the rotated one.
         let half = reach * (sin.abs() + cos.abs());
         let (right, down) = ([cos / cell, sin / cell], [-sin / cell, cos / cell]);
         let turned = simd.set(angle * (DIRECTIONS as f32 / TAU));
@@ -72,7 +72,7 @@ impl Kernel for Histograms<'_> {
         for y in pixels(extremum.y - half, extremum.y + half, plane.height) {
             let rows = rows_around(plane, y);
             let dy = y as f32 + 0.5 - extremum.y;
-            // The part of the row in the turned square: |cos dx + sin dy| and |cos dy - sin dx| are below its reach.
+            // The part of the row inside the rotated square, where |cos dx + sin dy| and |cos dy - sin dx| are below `reach`.
             let mut from_to = [-half, half];
             for [by_x, by_y] in [[cos, sin * dy], [-sin, cos * dy]] {
                 if by_x.abs() > 1e-6 {
@@ -87,13 +87,13 @@ impl Kernel for Histograms<'_> {
                 let dx = ramp + simd.set(x as f32 - extremum.x);
                 let u = dx * simd.set(right[0]) + simd.set(right[1] * dy);
                 let v = dx * simd.set(down[0]) + simd.set(down[1] * dy);
-                // A Gaussian of half the grid's side: 2 cells.
+                // A Gaussian whose standard deviation is half the grid's side: 2 cells.
                 let weight = magnitude * exp_minus(simd, (u * u + v * v) * simd.splat(1.0 / 8.0));
                 let weight = weight.masked(u.abs().lt(inside)).masked(v.abs().lt(inside));
                 let direction = eighths - turned;
                 let direction = (direction + simd.splat(8.0)).select(direction.lt(simd.splat(0.0)), direction);
                 let direction = (direction - simd.splat(8.0)).select(simd.splat(8.0).le(direction), direction);
-                // Lanes outside the square have no weight; they are kept within the array.
+                // Lanes outside the square have no weight; their indices are clamped to the array.
                 let bound = |at: S::F, last: f64| at.max(simd.splat(0.0)).min(simd.splat(last));
                 let (u, v) = (u + centre, v + centre);
                 let (column, row, bin) = (

@@ -1,25 +1,25 @@
-//! Extrema of the difference of Gaussians, placed between pixels and scales (Lowe 2004, 3.1 and 4; details as in VLFeat).
+//! Extrema of the difference of Gaussians, located between pixels and scales (Lowe 2004, 3.1 and 4; details as in VLFeat).
 
 use super::Sift;
 use super::scale_space::{BASE_SIGMA, FIRST_SCALE, Octave, Plane, SCALES};
 use irradia_compute::simd::{Kernel, Lanes, Mask, Simd};
 
-/// Differences of an octave.
+/// Number of differences in an octave.
 const DIFFERENCES: usize = SCALES + 2;
-/// The fraction of the peak threshold that a sample must reach before its place is refined (VLFeat).
+/// The fraction of the peak threshold that a sample must reach before its position is refined (VLFeat).
 const COARSE: f32 = 0.8;
-/// Moves by whole pixels during refinement (VLFeat).
+/// Maximum number of moves by whole pixels during refinement (VLFeat).
 const MAX_MOVES: usize = 5;
 
 /// An extremum of one octave.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Extremum {
     pub octave: usize,
-    /// The level nearest in scale.
+    /// The level of the sample from which the extremum was refined.
     pub level: usize,
-    /// Column in the octave's pixels, the first centre at 0.5.
+    /// Column in the octave's pixels; the centre of the first pixel is at 0.5.
     pub x: f32,
-    /// Row in the octave's pixels, the first centre at 0.5.
+    /// Row in the octave's pixels; the centre of the first pixel is at 0.5.
     pub y: f32,
     /// In the octave's pixels.
     pub sigma: f32,
@@ -27,7 +27,7 @@ pub(super) struct Extremum {
     pub peak: f32,
 }
 
-/// The extrema of `octave`, which has the number `number`, in order of scale, row and column of the sample they start from.
+/// The extrema of `octave`, whose number is `number`, sorted by scale, row and column of the sample that each starts from.
 pub(super) fn find_extrema(sift: &Sift, octave: &Octave, number: usize) -> Vec<Extremum> {
     let mut samples = sift.level.run(Samples {
         octave,
@@ -57,7 +57,7 @@ impl Kernel for Samples<'_> {
         let (width, height) = (levels[0].width, levels[0].height);
         let stride = levels[0].row(0).len();
         let mut found = Vec::new();
-        // Three rows of each difference suffice, which stay in cache. Loads begin a pixel to the left and to the right.
+        // Three rows of each difference are enough and stay in cache. Loads also begin one pixel to the left and to the right.
         let mut rows: [[Vec<f32>; 3]; DIFFERENCES] =
             std::array::from_fn(|_| std::array::from_fn(|_| vec![0.0; stride + 2 + S::LANES]));
         for y in 0..height {
@@ -90,7 +90,8 @@ impl Kernel for Samples<'_> {
     }
 }
 
-/// The lanes from column `x` that are extrema. `near` holds three rows of the difference itself, of the finer and of the coarser.
+/// The lanes from column `x` on that are extrema. `near` holds three rows of the difference itself, of the finer one and of the
+/// coarser one.
 #[inline(always)]
 fn extreme_lanes<S: Simd>(simd: S, near: &[[&[f32]; 3]; 3], x: usize, threshold: f32) -> u32
 where
@@ -98,7 +99,7 @@ where
 {
     let value = simd.load(&near[0][1][x..]);
     let mut candidates = simd.set(threshold).le(value.abs());
-    // Most vectors leave after the first plane.
+    // Most vectors have no candidates left after the first plane.
     for plane in 0..3 {
         if candidates.none() {
             return 0;
@@ -162,7 +163,7 @@ fn refine(sift: &Sift, octave: &Octave, number: usize, [mut x, mut y, scale]: [u
         }
         let peak = value + 0.5 * (gradient[0] * offset[0] + gradient[1] * offset[1] + gradient[2] * offset[2]);
         let determinant = xx * yy - xy * xy;
-        // Lowe 2004, eq. 4: trace^2 / determinant is (r + 1)^2 / r at the ratio r of principal curvatures.
+        // Lowe 2004, eq. 4: trace^2 / determinant is (r + 1)^2 / r for a ratio r of the principal curvatures.
         let r = sift.edge_threshold;
         let blob = determinant > 0.0 && (xx + yy) * (xx + yy) * r < (r + 1.0) * (r + 1.0) * determinant;
         let near = offset.iter().all(|o| o.abs() < 1.5);

@@ -1,29 +1,30 @@
-//! The shape of a feature: the ellipse that a tilted view makes of a disc (Baumberg 2000; Mikolajczyk and Schmid, "Scale and affine
+//! The affine shape of a feature: the ellipse as which a tilted disc appears (Baumberg 2000; Mikolajczyk and Schmid, "Scale and affine
 //! invariant interest point detectors", 2004).
 
 use super::extrema::Extremum;
 use super::scale_space::{FIRST_SCALE, Plane, gaussian, sigma_of};
 
-/// Side of a patch, px: what a descriptor reaches at any angle, with a margin.
+/// Side of a patch, px: the extent of a descriptor at any angle, plus a margin.
 const SIDE: usize = 40;
 /// Standard deviation of the feature in its patch, px.
 const PATCH_SIGMA: f32 = 1.6;
-/// Standard deviation of the window in which gradients tell the shape, in sigmas of the feature (VLFeat).
+/// Standard deviation of the window whose gradients determine the shape, in sigmas of the feature (VLFeat).
 const INTEGRATION: f32 = 3.0;
-/// Steps at most.
+/// Maximum number of steps.
 const STEPS: usize = 8;
-/// The ratio of the gradients' second moments from which on the shape is found.
+/// The shape has converged once the ratio of the axes of the gradients' second moments is below this.
 const ROUND: f32 = 1.1;
-/// The longest ellipse, as a ratio of its axes.
+/// Maximum ratio of an ellipse's axes.
 const LONGEST: f32 = 6.0;
-/// Blur below which it makes no difference, px.
+/// A blur of less than this makes no difference and is skipped, px.
 const SHARP: f32 = 0.4;
-/// Sigmas at which a blur is truncated.
+/// Number of sigmas at which a blur is truncated.
 const REACH: f32 = 3.0;
-/// How much more blurred a level may be than wanted: levels are discrete, and a little more is nearer than much less.
+/// Factor by which a level may be more blurred than requested: levels are discrete, and slightly too much is closer than far too
+/// little.
 const MORE_BLURRED: f32 = 1.12;
 
-/// The surroundings of `extremum` as they look from the front, up to a turn, and the extremum there.
+/// The surroundings of `extremum` as seen from the front, up to a rotation, and the extremum in this patch.
 pub(super) fn frontal_patch(octaves: &[Vec<Plane>], extremum: &Extremum) -> (Plane, Extremum) {
     let centre = Extremum {
         x: 0.5 * SIDE as f32,
@@ -46,7 +47,7 @@ pub(super) fn frontal_patch(octaves: &[Vec<Plane>], extremum: &Extremum) -> (Pla
     (patch, centre)
 }
 
-/// An ellipse of the area of the unit disc.
+/// An ellipse with the area of the unit disc.
 #[derive(Clone, Copy, Debug)]
 struct Ellipse {
     /// Direction of the long axis.
@@ -65,14 +66,14 @@ impl Ellipse {
         self.long * self.long
     }
 
-    /// The ellipse in whose patch the second moments `[xx, xy, yy]` become equal, if they are far from it.
+    /// The ellipse in whose patch the second moments, now `[xx, xy, yy]`, become equal; `None` if they nearly are.
     fn rounder(&self, [xx, xy, yy]: [f32; 3]) -> Option<Self> {
         let det = xx * yy - xy * xy;
         let [short, long] = eigenvalues([xx, xy, yy]);
         if det <= 1e-6 * (0.5 * (xx + yy)).powi(2) || long < ROUND * ROUND * short {
             return None;
         }
-        // C' = B M^-1 B^T, B the patch's axes in the photograph.
+        // C' = B M^-1 B^T, where B holds the patch's axes in the photograph.
         let scale = 1.0 / det.sqrt();
         let inverse = [yy * scale, -xy * scale, xx * scale];
         let ([c, s], a, b) = (self.axis, self.long, 1.0 / self.long);
@@ -89,12 +90,12 @@ impl Ellipse {
         })
     }
 
-    /// The ellipse around `extremum`, as a disc.
+    /// The patch in which the ellipse around `extremum` is a disc.
     fn patch(&self, octaves: &[Vec<Plane>], extremum: &Extremum) -> Plane {
         let sigma = extremum.sigma;
         let (octave, level) = level_of(octaves, extremum.octave, sigma / self.long);
         let plane = &octaves[octave][level];
-        // Pixels of the plane by those of the extremum's octave.
+        // Pixels of the plane per pixel of the extremum's octave.
         let finer = (1u32 << (extremum.octave - octave)) as f32;
         let blur = sigma_of(level + FIRST_SCALE) / finer;
         let step = sigma / PATCH_SIGMA;
@@ -124,14 +125,14 @@ impl Ellipse {
     }
 }
 
-/// Of the symmetric matrix `[xx, xy, yy]`, ascending.
+/// Eigenvalues of the symmetric matrix `[xx, xy, yy]`, ascending.
 fn eigenvalues([xx, xy, yy]: [f32; 3]) -> [f32; 2] {
     let (mean, half) = (0.5 * (xx + yy), 0.5 * (xx - yy));
     let spread = (half * half + xy * xy).sqrt();
     [mean - spread, mean + spread]
 }
 
-/// The most blurred level that is blurred by about `sigma` pixels of octave `from` at most: its octave, and its index there.
+/// The octave and index of the most blurred level whose blur is at most about `sigma` pixels of octave `from`.
 fn level_of(octaves: &[Vec<Plane>], from: usize, sigma: f32) -> (usize, usize) {
     let wanted = MORE_BLURRED * sigma;
     for octave in (0..=from).rev() {
@@ -145,7 +146,7 @@ fn level_of(octaves: &[Vec<Plane>], from: usize, sigma: f32) -> (usize, usize) {
     (0, 0)
 }
 
-/// The value at `(x, y)`, bilinear; the border is repeated outside.
+/// The bilinearly interpolated value at `(x, y)`; the border is repeated outside.
 fn between(plane: &Plane, x: f32, y: f32) -> f32 {
     let x = (x - 0.5).clamp(0.0, plane.width as f32 - 1.001);
     let y = (y - 0.5).clamp(0.0, plane.height as f32 - 1.001);
@@ -192,7 +193,7 @@ fn blur_columns(plane: &mut Plane, sigma: f32) {
     }
 }
 
-/// `[xx, xy, yy]` of the gradients of a patch, in a Gaussian window.
+/// The second moments `[xx, xy, yy]` of a patch's gradients in a Gaussian window.
 fn second_moments(patch: &Plane) -> [f32; 3] {
     let scale = 0.5 / (INTEGRATION * PATCH_SIGMA).powi(2);
     let weights: [f32; SIDE] = std::array::from_fn(|i| {

@@ -1,10 +1,10 @@
-//! Gradients of a row of pixels, in polar form, in vectors. Nothing is fused, so that every instruction set agrees to the bit.
+//! Vectorised gradients of a row of pixels in polar form. No operation is fused, so that all instruction sets agree to the bit.
 
 use super::scale_space::Plane;
 use irradia_compute::simd::{Lanes, Simd};
 
-/// Magnitude and direction of the gradients at columns `x..x + LANES` of row `y`, by central differences. The direction is in
-/// \[0, 8\], in eighths of a turn from +x towards +y. The pixel's neighbours must exist in all lanes that are used.
+/// Magnitude and direction of the gradients at columns `x..x + LANES` of the middle row, by central differences. The direction is in
+/// \[0, 8\], in eighths of a turn from +x towards +y. The pixels' neighbours must exist in all lanes that are used.
 #[inline(always)]
 pub(super) fn polar<S: Simd>(simd: S, rows: [&[f32]; 3], x: usize) -> [S::F; 2]
 where
@@ -33,7 +33,7 @@ where
     let (short, long) = (ax.min(ay), ax.max(ay));
     let t = short / long.max(simd.splat(1e-30));
     let t2 = t * t;
-    // atan(t) * 4 / pi for t in [0, 1]: least squares at Chebyshev nodes of an odd polynomial.
+    // atan(t) * 4 / pi for t in [0, 1]: an odd polynomial, fitted by least squares at Chebyshev nodes.
     let mut a = simd.splat(ATAN[5]);
     for i in (0..5).rev() {
         a = a * t2 + simd.splat(ATAN[i]);
@@ -55,13 +55,13 @@ const ATAN: [f64; 6] = [
     -0.0149212656,
 ];
 
-/// `e^-t` for t in \[0, 4.6\], within 1e-5: a power of a polynomial.
+/// `e^-t` for t in \[0, 4.6\], within 1e-5: the 16th power of a polynomial.
 #[inline(always)]
 pub(super) fn exp_minus<S: Simd>(simd: S, t: S::F) -> S::F
 where
     S::F: Lanes<Scalar = f32>,
 {
-    // Taylor's series of e^(-t/16), then four squarings.
+    // The Taylor series of e^(-t/16), then four squarings.
     let u = t * simd.splat(-1.0 / 16.0);
     let mut e = simd.splat(1.0 / 120.0);
     for coefficient in [1.0 / 24.0, 1.0 / 6.0, 0.5, 1.0, 1.0] {
@@ -104,7 +104,7 @@ mod tests {
         let all: Vec<_> = Level::all().into_iter().map(|level| level.run(Sweep)).collect();
         for (i, [angle, e]) in all[0].iter().enumerate() {
             let off = (angle - i as f32 * 8.0 / 3600.0).abs();
-            // Just below a whole turn may be 0.
+            // A result of a full turn is equivalent to 0.
             assert!(off.min((off - 8.0).abs()) < 1e-5, "{i}: {angle}");
             assert!((e - (-(i as f32) * 4.6 / 3600.0).exp()).abs() < 1e-5, "{i}: {e}");
         }

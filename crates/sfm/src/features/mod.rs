@@ -1,7 +1,7 @@
-//! Features of a photograph: where they are and what they look like.
+//! Features of a photograph: keypoints and their descriptors.
 //!
 //! [`Sift`] follows Lowe (2004) with the settings of COLMAP and VLFeat. Arithmetic is in single precision without fused operations,
-//! so that every instruction set finds the same bytes.
+//! so that every instruction set gives the same bytes.
 
 mod descriptor;
 mod extrema;
@@ -16,20 +16,20 @@ use crate::Features;
 
 pub use sift::Sift;
 
-/// A photograph in grey, 8 bits a pixel.
+/// A greyscale photograph, 8 bits per pixel.
 #[derive(Clone, Copy, Debug)]
 pub struct GreyPhoto<'a> {
     /// Width in pixels.
     pub width: u32,
     /// Height in pixels.
     pub height: u32,
-    /// `[H, W]`.
+    /// `[H, W]` grey levels.
     pub data: &'a [u8],
     /// `[H, W]`; pixels below 128 have no features.
     pub mask: Option<&'a [u8]>,
 }
 
-/// Finds the features of photographs. Extractors are serial: photographs are what is processed in parallel.
+/// Finds the features of photographs. An extractor is serial: callers process several photographs in parallel.
 pub trait Extractor: Sync {
     /// The features of `photo`, largest scale first.
     ///

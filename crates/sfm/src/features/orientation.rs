@@ -10,11 +10,11 @@ use std::f32::consts::TAU;
 const BINS: usize = 36;
 /// Standard deviation of the window, in sigmas of the extremum.
 const WINDOW: f32 = 1.5;
-/// Passes of a box of three bins that smooth the histogram.
+/// Number of passes of a box filter over three bins that smooth the histogram.
 const SMOOTHING: usize = 6;
-/// Peaks at least this fraction of the highest are directions too.
+/// Further peaks are directions too if they reach this fraction of the highest.
 const PEAK: f32 = 0.8;
-/// Pixels across the window of the largest extremum, and a vector.
+/// Pixels across the window of the largest extremum, plus the length of a vector.
 const ACROSS: usize = 64;
 
 /// The strongest directions, at most two, in radians from +x towards +y.
@@ -35,12 +35,12 @@ pub(super) fn orientations(level: Level, plane: &Plane, extremum: &Extremum) -> 
             peaks.push([at, TAU * (i as f32 + 0.5 + offset) / BINS as f32]);
         }
     }
-    // Stable: of equal peaks, the first.
+    // The sort is stable: of equal peaks, the first wins.
     peaks.sort_by(|a, b| b[0].total_cmp(&a[0]));
     [0, 1].map(|i| peaks.get(i).map(|peak| peak[1]))
 }
 
-/// Gradients' magnitudes by direction, in a Gaussian window; bin `i` is centred at `i + 1/2`.
+/// Magnitudes of gradients by direction, in a Gaussian window; bin `i` is centred at `i + 1/2`.
 struct Histogram<'a> {
     plane: &'a Plane,
     extremum: &'a Extremum,
@@ -56,7 +56,7 @@ impl Kernel for Histogram<'_> {
         let Self { plane, extremum } = self;
         let sigma = WINDOW * extremum.sigma;
         let radius = (3.0 * sigma).floor().max(1.0);
-        // Columns and rows whose neighbours exist too.
+        // Columns or rows that have neighbours on both sides.
         let span = |centre: f32, side: usize| {
             let middle = (centre as usize).min(side - 1);
             let radius = radius as usize;
@@ -85,7 +85,7 @@ impl Kernel for Histogram<'_> {
                     .store(&mut weight[to..]);
             }
             for i in 0..columns.len() {
-                // Shifted by one: half a bin below the first is in the last.
+                // Bins are shifted by one: directions less than half a bin above 0 also contribute to the last bin.
                 let bin = low[i].to_u32() as usize;
                 let upper = weight[i] * fraction[i];
                 histogram[bin] += weight[i] - upper;

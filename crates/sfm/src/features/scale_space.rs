@@ -1,28 +1,28 @@
 //! Octaves of Gaussian-blurred planes.
 //!
-//! Symbols: sigma, the standard deviation of a level's blur in the octave's pixels. Places are in pixels whose first centre is at
-//! (0.5, 0.5), so that an octave's place times its pixel's size is a place in the photograph, without offsets: octaves are doubled
-//! and halved about corners, not centres, and a photograph turned by 90 degrees has the same features.
+//! Symbols: sigma, the standard deviation of a level's blur in the octave's pixels. Positions are in pixels, with the first centre at
+//! (0.5, 0.5), so a position in an octave times the size of its pixels is a position in the photograph, without offsets: octaves are
+//! doubled and halved about corners, not centres, and a photograph turned by 90 degrees has the same features.
 
 use irradia_compute::Level;
 use irradia_compute::simd::{Kernel, Lanes, Simd};
 
-/// Scales an octave is divided into.
+/// Number of scales per octave.
 pub(super) const SCALES: usize = 3;
-/// Blurred planes of an octave: extrema need a difference on either side.
+/// Number of blurred planes in an octave: extrema need a difference on either side.
 const LEVELS: usize = SCALES + 3;
-/// The first difference in which extrema are sought, and the first level at which they are described.
+/// The first difference that is searched for extrema, and the first level at which they are described.
 pub(super) const FIRST_SCALE: usize = 1;
 /// Blur of an octave's first level (Lowe 2004, 3.3).
 pub(super) const BASE_SIGMA: f32 = 1.6;
 /// Blur that a photograph is assumed to have, in its own pixels (Lowe 2004, 3.3).
 const CAMERA_SIGMA: f32 = 0.5;
-/// The least side of an octave in pixels: a smaller one has no room for a descriptor.
+/// Minimum side of an octave in pixels: a smaller one has no room for a descriptor.
 const MIN_SIDE: usize = 16;
 /// Lanes of the widest vector.
 const WIDEST: usize = 16;
 
-/// A plane of floats. Rows are padded so that a vector can be loaded at every pixel and its neighbours.
+/// A plane of floats. Rows are padded so that a vector can be loaded at every pixel and at its neighbours.
 #[derive(Clone, Debug)]
 pub(super) struct Plane {
     pub width: usize,
@@ -73,7 +73,7 @@ impl Plane {
         self.row(y.clamp(0, self.height as isize - 1) as usize)
     }
 
-    /// Twice the size, by cubic convolution (Keys 1981), which unlike linear interpolation does not blur.
+    /// The plane at twice the size, by cubic convolution (Keys 1981), which does not blur as linear interpolation does.
     fn doubled(&self) -> Self {
         // The kernel at distances 1.75, 0.75, 0.25 and 1.25: a new pixel's centre is a quarter of a pixel from an old one's.
         const TAPS: [f32; 4] = [-0.023_437_5, 0.226_562_5, 0.867_187_5, -0.070_312_5];
@@ -97,7 +97,7 @@ impl Plane {
         to
     }
 
-    /// Half the size: the mean of each 2 x 2 pixels. A last odd row or column is dropped.
+    /// The plane at half the size: the mean of each block of 2 x 2 pixels. A last odd row or column is dropped.
     fn halved(&self) -> Self {
         let mut to = Self::new(self.width / 2, self.height / 2);
         for (y, row) in to.rows_mut().enumerate() {
@@ -120,7 +120,7 @@ pub(super) fn sigma_of(level: usize) -> f32 {
 pub(super) struct Octave {
     /// `[LEVELS]`, from the least blurred.
     pub levels: Vec<Plane>,
-    /// Size of a pixel in the photograph's.
+    /// Size of a pixel, in pixels of the photograph.
     pub pixel: f32,
 }
 
@@ -136,7 +136,7 @@ impl Octave {
         Some(Self::from_base(level, base, BASE_SIGMA * BASE_SIGMA, 0.5))
     }
 
-    /// `variance` is that of the blur of `base`.
+    /// The octave that starts from `base`, whose blur has the variance `variance`.
     fn from_base(level: Level, base: Plane, mut variance: f32, pixel: f32) -> Self {
         let mut levels = vec![base];
         for i in 1..LEVELS {
@@ -152,7 +152,7 @@ impl Octave {
     pub(super) fn halved(mut self, level: Level) -> (Vec<Plane>, Option<Self>) {
         let source = &self.levels[SCALES];
         let next = (source.width.min(source.height) / 2 >= MIN_SIDE).then(|| {
-            // The mean of 2 x 2 pixels adds a variance of 1/4 to the 4 sigma^2 of the level, in pixels half as large.
+            // In the smaller pixels of the source, the mean of 2 x 2 pixels adds a variance of 1/4 to the level's 4 sigma^2.
             let variance = BASE_SIGMA * BASE_SIGMA + 1.0 / 16.0;
             Self::from_base(level, source.halved(), variance, 2.0 * self.pixel)
         });

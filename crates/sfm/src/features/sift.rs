@@ -10,7 +10,7 @@ use crate::{DESCRIPTOR_BYTES, Features, Keypoint};
 use irradia_compute::Level;
 use irradia_scene::resize_area;
 
-/// Mask values from here on keep a feature, as everywhere else.
+/// Minimum mask value that keeps a feature, as everywhere else.
 const MASK_THRESHOLD: u8 = 128;
 
 /// Scale-invariant features (Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", 2004) with RootSIFT descriptors
@@ -19,16 +19,16 @@ const MASK_THRESHOLD: u8 = 128;
 pub struct Sift {
     /// Larger photographs are reduced until their longer side has this many pixels. Default 1600.
     pub max_side: u32,
-    /// The most features of a photograph. Default 4096.
+    /// Maximum number of features in a photograph. Default 4096.
     pub max_features: usize,
-    /// The least difference of Gaussians of an extremum, for pixels in \[0, 1\]. Default 0.02 / 3, as COLMAP's.
+    /// Minimum difference of Gaussians at an extremum, for pixels in \[0, 1\]. Default 0.02 / 3, as in COLMAP.
     pub peak_threshold: f32,
-    /// The largest ratio of principal curvatures. Default 10, as Lowe's and COLMAP's.
+    /// Maximum ratio of principal curvatures. Default 10, as in Lowe (2004) and COLMAP.
     pub edge_threshold: f32,
-    /// Whether features also have frontal descriptors. Default false: they take three times as long, and are worth it only where views differ by so much that
-    /// the others do not match.
+    /// Whether features also have frontal descriptors. Default false: extraction takes three times as long, which pays off only where
+    /// views differ so much that the usual descriptors do not match.
     pub frontal: bool,
-    /// What [`Level::detect`] found; tests choose others.
+    /// The result of [`Level::detect`]; tests choose others.
     pub level: Level,
 }
 
@@ -76,7 +76,7 @@ impl Extractor for Sift {
 }
 
 impl Sift {
-    /// The features of `photo` where `keep` holds, in its pixels.
+    /// The features of `photo` at the positions for which `keep` returns true, in its pixels.
     fn in_plane(&self, photo: &Plane, keep: impl Fn([f32; 2]) -> bool) -> Features {
         let mut octaves: Vec<Vec<Plane>> = Vec::new();
         let mut extrema: Vec<Extremum> = Vec::new();
@@ -96,7 +96,7 @@ impl Sift {
             next = halved;
         }
         let mut found: Vec<(Keypoint, [u8; DESCRIPTOR_BYTES], [u8; DESCRIPTOR_BYTES])> = Vec::new();
-        // A product rather than either factor: large blobs are repeatable, strong ones are well placed.
+        // The product of scale and peak: large blobs are repeatable, strong ones are well localised.
         let importance: Vec<[f32; 3]> = places
             .iter()
             .zip(&extrema)
@@ -117,7 +117,7 @@ impl Sift {
                 let Some((angle, _)) = described.or(frontal) else {
                     continue;
                 };
-                // Of a feature that has a frontal descriptor alone, the angle is that in its patch.
+                // If a feature has only a frontal descriptor, its angle is the one in its patch.
                 let [descriptor, frontal] = [described, frontal].map(|d| d.map_or(NO_DESCRIPTOR, |d| d.1));
                 found.push((Keypoint { x, y, scale, angle }, descriptor, frontal));
             }
@@ -136,7 +136,7 @@ impl Sift {
         }
     }
 
-    /// The angles and descriptors at `extremum`, the strongest first.
+    /// The angles and descriptors at `extremum`, strongest first.
     fn described(&self, plane: &Plane, extremum: &Extremum) -> [Option<(f32, [u8; DESCRIPTOR_BYTES])>; 2] {
         orientations(self.level, plane, extremum)
             .map(|angle| angle.and_then(|angle| Some((angle, describe(self.level, plane, extremum, angle)?))))
@@ -144,7 +144,7 @@ impl Sift {
 }
 
 impl Features {
-    /// The same features of a photograph that is larger by `[x, y]`.
+    /// The same features in a photograph enlarged by the factors `[x, y]`.
     pub fn scaled(mut self, [x, y]: [f32; 2]) -> Self {
         for keypoint in &mut self.keypoints {
             keypoint.x *= x;

@@ -1,12 +1,12 @@
 /// Cells along the longer side of a photograph.
 const CELLS: f32 = 16.0;
-/// The fraction of all places that is shared out evenly among the cells. With an even share for all of them, photographs of a
-/// street had 40 % fewer verified matches: repeatable features are not spread evenly.
+/// The fraction of `count` that is distributed evenly among the cells. With all of it distributed evenly, photographs of a street had
+/// 40 % fewer verified matches: repeatable features are not spread evenly.
 const EVEN: f32 = 0.25;
 
-/// The indices of at most `count` of `places`, `[x, y, importance]` in a photograph of `size` pixels: each cell of a grid chooses its
-/// most important, up to an even share, and the most important of the rest follow. Texture in one corner leaves no other cell
-/// without features.
+/// The indices of at most `count` of `places`, `[x, y, importance]` in a photograph of `size` pixels: the most important ones of each
+/// cell of a grid, up to an even share, then the most important of the rest. Strong texture in one corner thus does not take the
+/// features of other cells.
 pub(super) fn spread(places: &[[f32; 3]], size: [usize; 2], count: usize) -> Vec<usize> {
     let side = size[0].max(size[1]) as f32 / CELLS;
     let columns = (size[0] as f32 / side).ceil() as usize;
@@ -43,7 +43,7 @@ mod tests {
         let chosen = spread(&places, [160, 100], 800);
         assert_eq!(chosen.len(), 800);
         assert!((2000..2016).all(|i| chosen.contains(&i)));
-        // The rest by importance, equals in their order.
+        // The rest is sorted by importance, equal ones by index.
         assert_eq!(chosen[799], 783);
         assert_eq!(spread(&places, [160, 100], 5000).len(), 2016);
     }

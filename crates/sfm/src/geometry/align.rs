@@ -32,7 +32,7 @@ impl Alignment {
 
 /// The least-squares similarity from pairs (source, target) (Umeyama 1991); `None` for fewer than two distinct points.
 ///
-/// Points on one line leave the rotation about it undefined; it is then the one that the singular vectors happen to give.
+/// For points on a line the rotation about it is undefined; the result is then an arbitrary one.
 pub fn align(pairs: &[(DVec3, DVec3)]) -> Option<Alignment> {
     let n = pairs.len() as f64;
     let from_mean = pairs.iter().map(|p| p.0).sum::<DVec3>() / n;

@@ -6,19 +6,20 @@ use irradia_scene::{Intrinsics, Lens};
 /// Number of parameters: fx, fy, cx, cy, then k1, k2, p1, p2, or k1 to k4 of a fisheye.
 pub const PARAMETERS: usize = 8;
 
-/// The angle from a fisheye's axis up to which it is used, radians: beyond, the plane z = 1 on which poses are found is too far out.
+/// Maximum angle from a fisheye's axis that is used, radians: beyond it, points on the plane z = 1, on which poses are estimated, are too
+/// far out.
 const WIDEST: f64 = 1.35;
 
 /// Intrinsics of a camera with OpenCV's first four lens coefficients (COLMAP's `OPENCV`), or of a fisheye (`OPENCV_FISHEYE`).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DCamera {
-    /// Photographs' width, px.
+    /// Width of the photographs, px.
     pub width: u32,
-    /// Photographs' height, px.
+    /// Height of the photographs, px.
     pub height: u32,
     /// fx, fy, cx, cy in px, then k1, k2, p1, p2, or k1 to k4 of a fisheye; the first pixel's centre is at 0.5.
     pub parameters: [f64; PARAMETERS],
-    /// Whether the distance from the centre follows the angle from the axis, not its tangent.
+    /// Whether the distance from the centre is a function of the angle from the axis, not of its tangent.
     pub fisheye: bool,
 }
 
@@ -45,7 +46,7 @@ impl DCamera {
         }
     }
 
-    /// The camera of `k`, whose lens is ignored.
+    /// The camera with the focal lengths and principal point of `k`, whose lens is ignored.
     pub fn pinhole(k: &Intrinsics) -> Self {
         Self {
             width: k.width,
@@ -55,18 +56,18 @@ impl DCamera {
         }
     }
 
-    /// The longer side of its pictures, px.
+    /// The longer side of its photographs, px.
     pub fn long_side(&self) -> f64 {
         f64::from(self.width.max(self.height))
     }
 
-    /// Distance of the principal point from the middle, px.
+    /// Distance of the principal point from the centre, px.
     pub fn principal_offset(&self) -> f64 {
         let [_, _, cx, cy, ..] = self.parameters;
         (cx - 0.5 * f64::from(self.width)).hypot(cy - 0.5 * f64::from(self.height))
     }
 
-    /// Without tangential distortion, of which a fisheye has none.
+    /// The camera without tangential distortion, which a fisheye does not have.
     pub fn without_tangential(mut self) -> Self {
         if !self.fisheye {
             self.parameters[6..].fill(0.0);
@@ -94,7 +95,7 @@ impl DCamera {
         }
     }
 
-    /// Pixels per unit of the plane z = 1 at a point of it, away from the axis, where a fisheye has fewest.
+    /// Pixels per unit of the plane z = 1 at the point `p` of it, in the radial direction, in which a fisheye has the fewest.
     pub fn focal_at(&self, p: DVec2) -> f64 {
         if self.fisheye {
             self.focal() * self.angle_slope(p.length().atan()) / (1.0 + p.length_squared())
@@ -103,7 +104,7 @@ impl DCamera {
         }
     }
 
-    /// Pixels of a point in camera axes, in front of the camera.
+    /// The pixel of a point in camera axes, in front of the camera.
     #[inline(always)]
     pub fn pixel(&self, p: DVec3) -> DVec2 {
         let [fx, fy, cx, cy, ..] = self.parameters;
@@ -126,10 +127,11 @@ impl DCamera {
         1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
     }
 
-    /// A fisheye's distance from the centre by that on the plane z = 1, r, and its derivative by r, divided by r.
+    /// A fisheye's distance from the centre divided by the distance r on the plane z = 1, and the derivative of this ratio by r, divided
+    /// by r.
     fn fisheye_scale(&self, x: f64, y: f64) -> [f64; 2] {
         let r2 = x * x + y * y;
-        // The first terms of both, where their differences would cancel.
+        // The first terms of both series, where the differences below would cancel.
         if r2 < 1e-8 {
             let slope = self.parameters[4] - 1.0 / 3.0;
             return [1.0 + slope * r2, 2.0 * slope];
@@ -172,7 +174,7 @@ impl DCamera {
         ]
     }
 
-    /// Pixels of a point in camera axes, in front of the camera, with derivatives.
+    /// The pixel of a point in camera axes, in front of the camera, with derivatives.
     #[inline(always)]
     pub fn project(&self, p: DVec3) -> Projection {
         let [fx, fy, cx, cy, ..] = self.parameters;
@@ -236,7 +238,7 @@ impl DCamera {
         None
     }
 
-    /// As [`Self::unproject`], of a place in focal lengths from the centre.
+    /// Like [`Self::unproject`], for a position in focal lengths from the centre.
     fn unproject_fisheye(&self, target: DVec2) -> Option<DVec2> {
         let distance = target.length();
         let mut theta = distance.min(WIDEST);

@@ -11,9 +11,9 @@ const PAD: usize = 16;
 /// Corresponding points of two photographs.
 #[derive(Clone, Debug, Default)]
 pub struct Correspondences {
-    /// `[N]` the points in the first and in the second photograph, of one plane each, about 1 in magnitude.
+    /// `[N]` the points in the first and in the second photograph, on an image plane each, about 1 in magnitude.
     pub points: Vec<[DVec2; 2]>,
-    /// x and y in the first, x and y in the second, padded with NaN, which is an outlier of every model.
+    /// x and y in the first, x and y in the second, padded with NaN, which is an outlier for every model.
     planes: [Vec<f32>; 4],
 }
 
@@ -35,7 +35,7 @@ impl Correspondences {
         Self { points, planes }
     }
 
-    /// MSAC cost and number of inliers of an epipolar matrix (`b^T m a = 0`) by Sampson's distance.
+    /// MSAC cost and number of inliers of an epipolar matrix (`b^T m a = 0`) by the Sampson distance.
     pub fn epipolar_cost(&self, m: &DMat3, threshold: f64) -> (f64, usize) {
         self.cost::<Epipolar>(m, threshold)
     }
@@ -57,7 +57,7 @@ impl Correspondences {
     }
 }
 
-/// Squared residuals of a two-view model `m`, column by column.
+/// Squared residuals of a two-view model `m`, which is stored column by column.
 trait Residual {
     fn squared<F: Lanes<Scalar = f32>>(m: &[F; 9], x: F, y: F, u: F, v: F) -> F;
 }
@@ -129,7 +129,7 @@ impl<R: Residual> Kernel for Cost<'_, R> {
     }
 }
 
-/// Sampson's squared distance of `b^T m a = 0`, in the squared units of the points.
+/// The squared Sampson distance of `b^T m a = 0`, in the squared units of the points.
 pub fn sampson_squared(m: &DMat3, [a, b]: [DVec2; 2]) -> f64 {
     let (line_b, line_a) = (*m * a.extend(1.0), m.transpose() * b.extend(1.0));
     let algebraic = b.extend(1.0).dot(line_b);

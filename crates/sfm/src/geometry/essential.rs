@@ -6,7 +6,7 @@ use super::linear::{null_space, real_roots, solve_spd, svd3};
 use super::ransac::Estimator;
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
-/// A rigid motion between two cameras: `x_b = rotation x_a + translation`, the translation of length 1.
+/// A rigid motion between two cameras: `x_b = rotation x_a + translation`, with a translation of length 1.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Motion {
     /// From the first camera's axes to the second's.
@@ -21,7 +21,7 @@ impl Motion {
         cross_matrix(self.translation) * DMat3::from_quat(self.rotation)
     }
 
-    /// The depths of a correspondence in both cameras, by the midpoint of both rays.
+    /// The depths of a correspondence in both cameras, where its rays are closest to each other.
     pub fn depths(&self, [a, b]: [DVec2; 2]) -> [f64; 2] {
         let (a, b) = (self.rotation * a.extend(1.0), b.extend(1.0));
         // Least squares of z_b b = z_a a + t.
@@ -61,7 +61,7 @@ pub fn motions(essential: DMat3) -> [Motion; 4] {
     })
 }
 
-/// The motion of an essential matrix that places most points in front of both cameras, and how many.
+/// The motion of an essential matrix with the most points in front of both cameras, and their number.
 pub fn motion_in_front<'a>(essential: DMat3, points: impl Iterator<Item = &'a [DVec2; 2]> + Clone) -> (Motion, usize) {
     motions(essential)
         .map(|motion| {
@@ -72,7 +72,7 @@ pub fn motion_in_front<'a>(essential: DMat3, points: impl Iterator<Item = &'a [D
             (motion, count)
         })
         .into_iter()
-        // The first of equals, so that rounding cannot choose.
+        // The first of equals, for a result that does not depend on rounding.
         .reduce(|best, next| if next.1 > best.1 { next } else { best })
         .expect("four motions")
 }
@@ -82,7 +82,7 @@ type Linear = [f64; 4];
 type Quadratic = [f64; 10];
 type Cubic = [f64; 20];
 
-/// Exponents of x, y, z: the order of Nister (2004), with which elimination leaves polynomials in z.
+/// Exponents of x, y, z in the order of Nister (2004), in which elimination leaves polynomials in z.
 const MONOMIALS: [[u8; 3]; 20] = [
     [3, 0, 0],
     [0, 3, 0],
@@ -119,7 +119,7 @@ const QUADRATIC: [[u8; 3]; 10] = [
     [0, 0, 0],
 ];
 
-/// Where the product of two monomials lies in `of`.
+/// The index in `of` of the product of two monomials.
 const fn product_table<const A: usize, const B: usize, const C: usize>(
     a: &[[u8; 3]; A],
     b: &[[u8; 3]; B],
@@ -161,7 +161,8 @@ fn add_cubic(a: &Quadratic, b: &Linear, to: &mut Cubic) {
     }
 }
 
-/// The essential matrices, at most ten, through five points (Nister, "An Efficient Solution to the Five-Point Relative Pose Problem", 2004).
+/// The essential matrices, at most ten, through five points (Nister, "An Efficient Solution to the Five-Point Relative Pose Problem",
+/// 2004).
 pub fn five_points(points: &[[DVec2; 2]; 5], models: &mut Vec<DMat3>) {
     let Some(basis) = null_space::<5, 9, 4>(points.map(epipolar_row)) else {
         return;
@@ -203,7 +204,7 @@ pub fn five_points(points: &[[DVec2; 2]; 5], models: &mut Vec<DMat3>) {
     if !eliminate(&mut rows) {
         return;
     }
-    // Rows 4 to 9 begin with x^2 z, x^2, y^2 z, y^2, x y z, x y: each pair's difference is linear in x and y.
+    // Rows 4 to 9 begin with x^2 z, x^2, y^2 z, y^2, x y z, x y: the first of each pair minus z times the second is linear in x and y.
     let mut b = [[[0.0; 5]; 3]; 3];
     for (row, b) in b.iter_mut().enumerate() {
         let (upper, lower) = (&rows[4 + 2 * row][10..], &rows[5 + 2 * row][10..]);
@@ -220,7 +221,7 @@ pub fn five_points(points: &[[DVec2; 2]; 5], models: &mut Vec<DMat3>) {
             for q in 0..5 {
                 let minor = b[1][i][p] * b[2][j][q] - b[1][j][p] * b[2][i][q];
                 for r in 0..5 {
-                    // The columns of x and y have degree 3, that of 1 has 4: higher products are zero.
+                    // The columns of x and y have degree 3, the column of 1 has degree 4: higher products are zero.
                     if p + q + r <= 10 {
                         determinant[p + q + r] += minor * b[0][c][r];
                     }
@@ -280,7 +281,7 @@ fn eliminate(rows: &mut [[f64; 20]; 10]) -> bool {
     true
 }
 
-/// Gauss-Newton steps on Sampson's distance over rotation and direction of translation, for points within `threshold`.
+/// Gauss-Newton steps on the Sampson distance over rotation and direction of translation, for points within `threshold`.
 pub fn refine_motion(start: Motion, points: &[[DVec2; 2]], threshold: f64, steps: usize) -> Option<Motion> {
     let mut motion = start;
     let limit = threshold * threshold;
@@ -299,7 +300,7 @@ pub fn refine_motion(start: Motion, points: &[[DVec2; 2]], threshold: f64, steps
             if algebraic * algebraic >= limit * squared_length {
                 continue;
             }
-            // Sampson's denominator is held, as in iteratively reweighted least squares.
+            // The Sampson denominator is held fixed, as in iteratively reweighted least squares.
             let weight = 1.0 / squared_length;
             let y = motion.rotation * a;
             let turn = y.cross(b.cross(motion.translation));
@@ -323,16 +324,16 @@ pub fn refine_motion(start: Motion, points: &[[DVec2; 2]], threshold: f64, steps
     (motion.rotation.is_finite() && motion.translation.is_finite()).then_some(motion)
 }
 
-/// The problem of the essential matrix over correspondences on the planes z = 1.
+/// Estimation of the essential matrix from correspondences on the planes z = 1.
 pub struct Essential<'a> {
     /// The correspondences.
     pub points: &'a Correspondences,
-    /// Largest Sampson distance of an inlier.
+    /// Maximum Sampson distance of an inlier.
     pub threshold: f64,
 }
 
 impl Essential<'_> {
-    /// The points within the threshold of a model.
+    /// `[N]` whether each correspondence is within the threshold of a model.
     pub fn inliers(&self, model: &DMat3) -> Vec<bool> {
         let limit = self.threshold * self.threshold;
         self.points
@@ -397,7 +398,7 @@ mod tests {
             errors.push(best);
         }
         errors.sort_by(f64::total_cmp);
-        // Some samples are close to a double root, where half of the digits are lost.
+        // Some samples are close to a double root, where half the digits are lost.
         assert!(
             errors[50] < 1e-11 && errors[95] < 1e-6 && errors[100] < 1e-4,
             "{errors:?}"

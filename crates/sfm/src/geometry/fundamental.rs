@@ -16,7 +16,7 @@ pub fn seven_points(points: &[[DVec2; 2]; 7], models: &mut Vec<DMat3>) {
         return;
     };
     let (f, g) = (DMat3::from_cols_array(&f), DMat3::from_cols_array(&g));
-    // det(x f + g) at four places gives its coefficients.
+    // The values of det(x f + g) at four points give its coefficients.
     let at = |x: f64| (f * x + g).determinant();
     let (c0, c3) = (at(0.0), f.determinant());
     let (plus, minus) = (at(1.0), at(-1.0));
@@ -49,7 +49,7 @@ pub fn eight_points(points: impl Iterator<Item = ([DVec2; 2], f64)> + Clone) -> 
     Some(from_b.transpose() * singular * from_a)
 }
 
-/// Moves the points' mean to the origin and their mean distance to sqrt(2) (Hartley 1997).
+/// The similarity that moves the points' mean to the origin and scales their mean distance from it to sqrt(2) (Hartley 1997).
 pub(super) fn normalization(points: impl Iterator<Item = ([DVec2; 2], f64)> + Clone, side: usize) -> Option<DMat3> {
     let mut sum = DVec2::ZERO;
     let mut total = 0.0;
@@ -72,11 +72,11 @@ pub(super) fn apply(similarity: &DMat3, p: DVec2) -> DVec2 {
     similarity.x_axis.x * p + similarity.z_axis.truncate()
 }
 
-/// The problem of the fundamental matrix over correspondences.
+/// Estimation of the fundamental matrix from correspondences.
 pub struct Fundamental<'a> {
     /// The correspondences.
     pub points: &'a Correspondences,
-    /// Largest Sampson distance of an inlier.
+    /// Maximum Sampson distance of an inlier.
     pub threshold: f64,
 }
 
@@ -100,7 +100,7 @@ impl Estimator for Fundamental<'_> {
         let limit = self.threshold * self.threshold;
         let weighted = self.points.points.iter().filter_map(|p| {
             let squared = sampson_squared(model, *p);
-            // Sampson's denominator turns the algebraic error into pixels.
+            // The Sampson denominator turns the algebraic error into a distance.
             (squared < limit).then(|| {
                 let (b, a) = (*model * p[0].extend(1.0), model.transpose() * p[1].extend(1.0));
                 (
@@ -140,7 +140,7 @@ mod tests {
         let views = TwoViews::new(3, 200, 1e-3);
         let f = eight_points(views.points.iter().map(|p| (*p, 1.0))).expect("points in general position");
         let mean = views.points.iter().map(|p| sampson_squared(&f, *p)).sum::<f64>() / 200.0;
-        // Sampson's distance of noise s on four coordinates is s on average.
+        // With noise s on all four coordinates, the root mean square of the Sampson distance is s.
         assert!(mean.sqrt() < 1.1e-3, "{}", mean.sqrt());
         assert!(f.determinant().abs() < 1e-9 * f.x_axis.length_squared().max(1.0));
     }

@@ -1,4 +1,4 @@
-//! The homography `h`: `b ~ h a` for points of a plane, or of any scene seen from one place.
+//! The homography `h`: `b ~ h a` for points on a plane, or of any scene seen from one place.
 
 use super::correspondences::{Correspondences, transfer_squared};
 use super::fundamental::{apply, normalization};
@@ -14,7 +14,7 @@ fn transfer_rows([a, b]: [DVec2; 2]) -> [[f64; 9]; 2] {
     ]
 }
 
-/// The homography through four points; `None` if three lie on a line.
+/// The homography through four points; `None` if three are on a line.
 pub fn four_points(points: &[[DVec2; 2]; 4]) -> Option<DMat3> {
     let mut rows = [[0.0; 9]; 8];
     for (i, p) in points.iter().enumerate() {
@@ -53,7 +53,8 @@ pub fn rotation_between(points: impl Iterator<Item = [DVec2; 2]>) -> DMat3 {
     closest_rotation(sum)
 }
 
-/// How many of `points` one rotation explains with errors below `threshold` in the second photograph: the best of all, then of those within each distance of `coarser`.
+/// How many of `points` a rotation explains with errors below `threshold` in the second photograph. The rotation is fitted to all points,
+/// then again to those within each of the distances `coarser`.
 pub fn turned(points: &[[DVec2; 2]], coarser: &[f64], threshold: f64) -> usize {
     let close = |rotation: &DMat3, [a, b]: &[DVec2; 2], within: f64| {
         let turned = *rotation * a.extend(1.0);
@@ -66,11 +67,11 @@ pub fn turned(points: &[[DVec2; 2]], coarser: &[f64], threshold: f64) -> usize {
     points.iter().filter(|p| close(&rotation, p, threshold)).count()
 }
 
-/// The problem of the homography over correspondences.
+/// Estimation of the homography from correspondences.
 pub struct Homography<'a> {
     /// The correspondences.
     pub points: &'a Correspondences,
-    /// Largest distance of an inlier in the second photograph.
+    /// Maximum distance of an inlier in the second photograph.
     pub threshold: f64,
 }
 

@@ -1,6 +1,6 @@
 //! Small dense linear algebra: null spaces, symmetric eigenvectors, 3x3 singular values, linear systems, real roots.
 //!
-//! Sizes are at most 10, where a crate such as `nalgebra` (20 s of build) has nothing to win.
+//! Sizes are at most 10, for which a crate such as `nalgebra` (20 s of build time) has no advantage.
 
 use glam::{DMat3, DVec3};
 
@@ -13,7 +13,7 @@ pub fn scatter(vectors: impl Iterator<Item = DVec3>) -> [[f64; 3]; 3] {
     sum.to_cols_array_2d()
 }
 
-/// Eigenvalues, ascending, and the eigenvectors as rows of a symmetric matrix, by cyclic Jacobi rotations.
+/// Eigenvalues, ascending, and eigenvectors (as rows) of a symmetric matrix, by cyclic Jacobi rotations.
 pub fn symmetric_eigen<const N: usize>(mut a: [[f64; N]; N]) -> ([f64; N], [[f64; N]; N]) {
     let mut vectors = [[0.0; N]; N];
     for i in 0..N {
@@ -158,7 +158,7 @@ pub fn null_space<const R: usize, const N: usize, const K: usize>(mut rows: [[f6
     Some(basis)
 }
 
-/// Solves the symmetric positive definite system `a x = b` by Cholesky's factorisation; `None` if it is not positive definite.
+/// Solves the symmetric positive definite system `a x = b` by Cholesky factorisation; `None` if `a` is not positive definite.
 pub fn solve_spd<const N: usize>(mut a: [[f64; N]; N], mut b: [f64; N]) -> Option<[f64; N]> {
     for i in 0..N {
         for j in 0..=i {
@@ -196,7 +196,7 @@ pub fn cubic_roots(c: [f64; 4]) -> impl Iterator<Item = f64> {
     let scale = c.iter().fold(0.0f64, |m, x| m.max(x.abs()));
     let mut roots = [f64::NAN; 3];
     if c[3].abs() > 1e-14 * scale {
-        // Monic, depressed by x = y - a / 3.
+        // The monic cubic, depressed by x = y - a / 3.
         let (a, b, d) = (c[2] / c[3], c[1] / c[3], c[0] / c[3]);
         let q = (a * a - 3.0 * b) / 9.0;
         let r = (2.0 * a * a * a - 9.0 * a * b + 27.0 * d) / 54.0;
@@ -231,7 +231,7 @@ pub fn cubic_roots(c: [f64; 4]) -> impl Iterator<Item = f64> {
     })
 }
 
-/// The real roots of the polynomial with coefficients `c` from degree 0 up, by Sturm's chain and bisection.
+/// The real roots of the polynomial with coefficients `c` from degree 0 up, by a Sturm chain and bisection.
 ///
 /// Roots beyond 1 in magnitude are those of the reversed polynomial, so that both searches are over \[-1, 1\].
 pub fn real_roots<const N: usize>(c: [f64; N]) -> Vec<f64> {
@@ -301,14 +301,14 @@ fn roots_within_one<const N: usize>(c: &[f64; N], roots: &mut Vec<f64>) {
         }
         count
     };
-    // Intervals that hold at least one root, with the sign changes at both ends.
+    // Intervals with the sign changes at both ends and the depth of bisection.
     let mut intervals = vec![(-1.0, 1.0, changes(-1.0), changes(1.0), 0)];
     while let Some((low, high, at_low, at_high, depth)) = intervals.pop() {
         if at_low <= at_high {
             continue;
         }
         if at_low - at_high > 1 && depth < 40 {
-            // Off centre, because roots at round numbers would lie on the boundary.
+            // Slightly off centre, because roots at round numbers would otherwise be on the boundary.
             let middle = low + 0.4987 * (high - low);
             let at_middle = changes(middle);
             intervals.push((low, middle, at_low, at_middle, depth + 1));
@@ -319,7 +319,7 @@ fn roots_within_one<const N: usize>(c: &[f64; N], roots: &mut Vec<f64>) {
     }
 }
 
-/// Newton's method, which falls back to bisection where it leaves the bracket.
+/// The root in a bracket by Newton's method, with bisection where a step leaves the bracket.
 fn bracketed_root(c: &[f64], mut low: f64, mut high: f64) -> f64 {
     let rising = evaluate(c, high) >= 0.0;
     let mut x = 0.5 * (low + high);

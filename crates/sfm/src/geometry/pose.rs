@@ -12,7 +12,7 @@ pub struct DPose {
 }
 
 impl DPose {
-    /// The world's own axes.
+    /// A camera at the world's origin with the world's axes.
     pub const IDENTITY: Self = Self {
         rotation: DQuat::IDENTITY,
         position: DVec3::ZERO,
@@ -37,7 +37,7 @@ impl DPose {
         DMat3::from_quat(self.rotation.inverse())
     }
 
-    /// Moved by the small turn `turn` (camera axes, radians: `x_camera` becomes `exp(turn) x_camera`) and `shift` (world).
+    /// The pose moved by the small rotation `turn` (camera axes, radians: `x_camera` becomes `exp(turn) x_camera`) and by `shift` (world).
     pub fn moved(&self, turn: DVec3, shift: DVec3) -> Self {
         Self {
             rotation: (self.rotation * DQuat::from_scaled_axis(-turn)).normalize(),

@@ -2,15 +2,15 @@
 
 use irradia_scene::Rng;
 
-/// A problem whose minimal samples give candidate models.
+/// An estimation problem with candidate models from minimal samples.
 pub trait Estimator {
-    /// What is estimated.
+    /// The type of model that is estimated.
     type Model: Clone;
     /// Size of a minimal sample.
     const SAMPLE: usize;
     /// Number of observations.
     fn observations(&self) -> usize;
-    /// Adds the models through the observations `sample`.
+    /// Adds the models through the observations `sample` to `models`.
     fn fit(&self, sample: &[usize], models: &mut Vec<Self::Model>);
     /// The MSAC cost, a sum of squared residuals in units of the squared threshold, each at most 1, and the number of inliers.
     fn cost(&self, model: &Self::Model) -> (f64, usize);
@@ -21,11 +21,11 @@ pub trait Estimator {
 /// When to stop sampling.
 #[derive(Clone, Copy, Debug)]
 pub struct Limits {
-    /// Samples at most.
+    /// Maximum number of samples.
     pub samples: usize,
-    /// Probability that a sample of inliers alone was drawn, given the inliers found.
+    /// Probability, given the number of inliers found, that at least one sample of inliers only has been drawn.
     pub confidence: f64,
-    /// The seed; the same seed gives the same result.
+    /// Random seed; the same seed gives the same result.
     pub seed: u64,
 }
 
@@ -36,11 +36,11 @@ pub struct Estimate<M> {
     pub model: M,
     /// Its MSAC cost.
     pub cost: f64,
-    /// Its inliers.
+    /// Its number of inliers.
     pub inliers: usize,
 }
 
-/// The best model over random minimal samples, starting from the candidates `first`; `None` if there is none.
+/// The best of the candidates `first` and of the models through random minimal samples; `None` if there is none.
 pub fn estimate<E: Estimator>(problem: &E, first: Vec<E::Model>, limits: Limits) -> Option<Estimate<E::Model>> {
     let n = problem.observations();
     let mut best: Option<Estimate<E::Model>> = None;
@@ -73,12 +73,12 @@ pub fn estimate<E: Estimator>(problem: &E, first: Vec<E::Model>, limits: Limits)
     best
 }
 
-/// Samples needed for the confidence, given the inliers of the best model so far.
+/// Number of samples needed for the confidence, given the inliers of the best model so far.
 fn needed<M>(best: &Option<Estimate<M>>, n: usize, sample: usize, limits: Limits) -> usize {
     let Some(best) = best else { return limits.samples };
     let good = (best.inliers as f64 / n as f64).powi(sample as i32);
     if good >= 1.0 {
-        return 1;
+        return limits.samples.min(1);
     }
     let samples = (1.0 - limits.confidence).ln() / (1.0 - good).ln();
     limits.samples.min(if samples.is_finite() {
@@ -88,7 +88,7 @@ fn needed<M>(best: &Option<Estimate<M>>, n: usize, sample: usize, limits: Limits
     })
 }
 
-/// Replaces `best` by `model` if that is better, and by its refinements as long as they get better.
+/// Replaces `best` by `model` if that is better, refined as long as that improves it.
 fn consider<E: Estimator>(problem: &E, model: E::Model, best: &mut Option<Estimate<E::Model>>) {
     let (cost, inliers) = problem.cost(&model);
     if best.as_ref().is_some_and(|best| cost >= best.cost) || cost.is_nan() {
@@ -115,7 +115,7 @@ fn consider<E: Estimator>(problem: &E, model: E::Model, best: &mut Option<Estima
 mod tests {
     use super::*;
 
-    /// The mean of normal variates of deviation 1 among uniform outliers; a sample is one value.
+    /// The mean of normal variates with a standard deviation of 1 among uniform outliers; a sample is one value.
     struct Mean(Vec<f64>);
 
     impl Estimator for Mean {
@@ -165,7 +165,8 @@ mod tests {
             .collect();
         let mean = errors.iter().sum::<f64>() / runs as f64;
         let deviation = (errors.iter().map(|e| e * e).sum::<f64>() / runs as f64).sqrt();
-        // The mean of 200 variates deviates by 0.071, its mean over 300 runs by 0.0041; four of those, and a little for outliers.
+        // The mean of 200 variates has a standard deviation of 0.071, its mean over 300 runs one of 0.0041; the bounds are four of these
+        // and a margin for outliers.
         assert!(deviation < 0.10, "{deviation}");
         assert!(mean.abs() < 0.017, "{mean}");
     }

@@ -1,4 +1,4 @@
-//! A camera's pose from points of the world: three points, all points, and robustly.
+//! A camera's pose from world points: from three points, from all points, and robustly.
 
 use super::linear::{cubic_roots, solve_spd, symmetric_eigen};
 use super::pose::DPose;
@@ -7,7 +7,7 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use irradia_compute::simd::{Kernel, Lanes, Level, Mask, Simd};
 use irradia_compute::unroll;
 
-/// The poses, at most four, from which three points appear in the directions `bearings` (length 1)
+/// The poses, at most four, from which three points appear in the directions `bearings`, unit vectors
 /// (Persson and Nordberg, "Lambda Twist: An Accurate Fast Robust Perspective Three Point (P3P) Solver", 2018).
 pub fn three_points(bearings: [DVec3; 3], points: [DVec3; 3], poses: &mut Vec<DPose>) {
     let [y1, y2, y3] = bearings;
@@ -77,7 +77,7 @@ pub fn three_points(bearings: [DVec3; 3], points: [DVec3; 3], poses: &mut Vec<DP
     }
 }
 
-/// Newton steps on the three distances between points at depths `l` along the bearings.
+/// Refines the depths `l` along the bearings by Newton steps on the three distances between the points.
 fn polish_depths(mut l: [f64; 3], [a12, a13, a23]: [f64; 3], [b12, b13, b23]: [f64; 3]) -> [f64; 3] {
     for _ in 0..3 {
         let [l1, l2, l3] = l;
@@ -100,15 +100,15 @@ fn polish_depths(mut l: [f64; 3], [a12, a13, a23]: [f64; 3], [b12, b13, b23]: [f
     l
 }
 
-/// Points of the world and their projections in one photograph.
+/// World points and their projections in one photograph.
 pub struct Resection {
-    /// `[N]` projections on the plane z = 1, undistorted, and points of the world.
+    /// `[N]` undistorted projections on the plane z = 1, and world points.
     points: Vec<(DVec2, DVec3)>,
-    /// x, y, z of the world and both coordinates of the projection, padded with NaN.
+    /// x, y, z in the world and both coordinates of the projection, padded with NaN.
     planes: [Vec<f32>; 5],
-    /// The planes' origin: the mean of the points, so that `f32` suffices.
+    /// The origin of the planes: the mean of the points, so that `f32` is precise enough.
     origin: DVec3,
-    /// Largest error of an inlier on the plane z = 1.
+    /// Maximum error of an inlier on the plane z = 1.
     threshold: f64,
 }
 
@@ -137,12 +137,12 @@ impl Resection {
         }
     }
 
-    /// The best pose over random samples.
+    /// The best pose of the candidates `first` and of random samples.
     pub fn solve(&self, first: Vec<DPose>, limits: Limits) -> Option<Estimate<DPose>> {
         estimate(self, first, limits)
     }
 
-    /// Which points are within the threshold.
+    /// `[N]` whether each point is within the threshold.
     pub fn inliers(&self, pose: &DPose) -> Vec<bool> {
         self.points
             .iter()
@@ -162,7 +162,7 @@ impl Resection {
 
 struct Cost<'a> {
     problem: &'a Resection,
-    /// `x_camera = rotation x + translation`, column by column, x relative to the origin.
+    /// `x_camera = rotation x + translation`, column by column, with x relative to the origin.
     rotation: [f64; 9],
     translation: [f64; 3],
 }

@@ -1,4 +1,4 @@
-//! Two cameras before random points, for tests.
+//! Two cameras in front of random points, for tests.
 
 use super::essential::Motion;
 use glam::{DQuat, DVec2, DVec3};
@@ -10,12 +10,12 @@ pub struct TwoViews {
     pub motion: Motion,
     /// `[N]` world points, in the first camera's axes.
     pub world: Vec<DVec3>,
-    /// `[N]` the points on both planes z = 1.
+    /// `[N]` the projections of the points on both planes z = 1.
     pub points: Vec<[DVec2; 2]>,
 }
 
 impl TwoViews {
-    /// `count` points at depths of 3 to 8, with normal noise of deviation `noise` on both planes.
+    /// `count` points at depths of 3 to 8, with normal noise of standard deviation `noise` on both planes.
     pub fn new(seed: u64, count: usize, noise: f64) -> Self {
         let mut rng = Rng::new(seed, 77);
         let mut uniform = |low: f32, high: f32| f64::from(rng.range(low, high));

@@ -1,4 +1,4 @@
-//! A point from its projections.
+//! Triangulation: a point from its projections.
 
 use super::linear::solve_spd;
 use super::pose::DPose;
@@ -18,7 +18,7 @@ pub struct Sight {
 }
 
 impl Sight {
-    /// Of a camera at `pose`.
+    /// The sight of a camera at `pose`.
     pub fn new(pose: &DPose, at: DVec2, focal: f64) -> Self {
         Self {
             rotation: pose.camera_rotation(),
@@ -28,12 +28,12 @@ impl Sight {
         }
     }
 
-    /// The direction of the ray, world, of length 1.
+    /// Unit direction of the ray, world.
     pub fn direction(&self) -> DVec3 {
         self.rotation.transpose() * self.at.extend(1.0).normalize()
     }
 
-    /// The squared error of `point`, px^2; infinite behind the camera.
+    /// The squared reprojection error of `point`, px^2; infinite behind the camera.
     pub fn error_squared(&self, point: DVec3) -> f64 {
         let p = self.rotation * (point - self.position);
         if p.z <= 0.0 {
@@ -43,7 +43,7 @@ impl Sight {
     }
 }
 
-/// The point with the least sum of squared distances to all rays; `None` where they are parallel.
+/// The point with the smallest sum of squared distances to all rays; `None` if they are parallel.
 pub fn midpoint(sights: impl Iterator<Item = Sight>) -> Option<DVec3> {
     let mut normal = DMat3::ZERO;
     let mut right = DVec3::ZERO;
@@ -57,7 +57,7 @@ pub fn midpoint(sights: impl Iterator<Item = Sight>) -> Option<DVec3> {
     point.is_finite().then_some(point)
 }
 
-/// Gauss-Newton steps on the reprojection error, in pixels, from `start`.
+/// Refines `start` by Gauss-Newton steps on the reprojection error in pixels.
 pub fn refine_point(start: DVec3, sights: impl Iterator<Item = Sight> + Clone, steps: usize) -> Option<DVec3> {
     let mut point = start;
     for _ in 0..steps {

@@ -1,39 +1,40 @@
-//! Matches that should be there and are not.
+//! Matches that should exist and do not.
 //!
-//! Photographs taken from nearly the same place, the same way, share points. Where two share none, their poses are wrong together: what looks
-//! alike, a corridor on another floor, was taken for the same, or a thing was turned over between them, and the scale beside it was not.
-//! All matches that there are agree with such a model; those that are absent tell. After Zach, Irschara and Bischof, "What can missing
-//! correspondences tell us about 3D structure and motion?" (CVPR 2008).
+//! Photographs taken from nearly the same place in the same direction share points. Where two share none, their poses cannot both be
+//! right: either parts that look alike, such as corridors on two floors, were mistaken for one, or an object was turned over between the
+//! photographs while its surroundings, such as a scale bar, were not. All existing matches agree with such a model; only the absent ones
+//! reveal it. After Zach, Irschara and Bischof, "What can missing correspondences tell us about 3D structure and motion?" (CVPR 2008).
 
 use super::types::{Absent, Model, PhotoInfo};
 use rayon::prelude::*;
 
-/// Points of a photograph that are looked for in the others.
+/// Maximum number of points of a photograph that are projected into the others.
 const POINTS: usize = 200;
-/// Points that must be expected for a pair to tell.
+/// Minimum number of expected points for a pair to count as evidence.
 const EXPECTED: usize = 40;
-/// Fraction of the points of a photograph that must be expected in the other.
+/// Minimum fraction of the points of a photograph that are expected in the other.
 const SAME_VIEW: f64 = 0.5;
-/// Largest angle between the rays to a point, by its cosine (12 degrees), and largest ratio of its distances, at which it should be matched.
+/// A point should be matched up to this angle between its rays, given as a cosine (12 degrees), and up to this ratio of its distances.
 const ANGLE: f64 = 0.978;
 const RATIO: f64 = 1.35;
-/// Part of the picture along each axis, at its border, where points are not expected.
+/// Width of the border in which no points are expected, as a fraction of the photograph's side along each axis.
 const BORDER: f64 = 0.03;
-/// Fraction of the expected points below which photographs share next to none. Of those in right models, half share 0.2 to 0.8 of them.
+/// Photographs share next to nothing if they share less than this fraction of the expected points. In correct models, the middle half
+/// of the pairs share 0.2 to 0.8.
 const NONE: f64 = 0.1;
-/// Absent pairs from which on this is no chance. Of the models of 62 captures, three that are wrong have 13, 27 and 1,201; one of panoramas
-/// 10, all others at most 2.
+/// Minimum number of absent pairs that rules out coincidence. Of the models of 62 captures, the three wrong ones have 13, 27 and
+/// 1,201, one of panoramas has 10, and all others have at most 2.
 pub const ABSENT_PAIRS: usize = 12;
 
-/// Photographs that by their poses see the same.
+/// A pair of photographs whose poses say that they see the same part of the scene.
 pub(super) struct Overlap {
     /// The pair.
     pub pair: Absent,
-    /// Whether next to none of its points are matched.
+    /// Whether next to none of its expected points are matched.
     pub is_absent: bool,
 }
 
-/// All pairs of photographs that by their poses see the same.
+/// All pairs of photographs whose poses say that they see the same part of the scene.
 pub(super) fn overlaps(photos: &[PhotoInfo], model: &Model) -> Vec<Overlap> {
     let seen = points_of_photos(model, photos.len());
     (0..seen.len())
@@ -48,26 +49,27 @@ pub(super) fn overlaps(photos: &[PhotoInfo], model: &Model) -> Vec<Overlap> {
                     photos: [a as u32, b as u32],
                     expected: there[1].min(back[1]),
                 },
-                // Either must lack what the other shows: behind a corner, one does.
+                // Each must lack the points of the other: with an occluding corner, only one of them does.
                 is_absent: shares_none(there) && shares_none(back),
             })
         })
         .collect()
 }
 
-/// What is absent, pairs with most expected points first.
+/// The absent pairs, most expected points first.
 pub(super) fn absent_of(overlaps: &[Overlap]) -> Vec<Absent> {
     let mut found: Vec<Absent> = overlaps.iter().filter(|o| o.is_absent).map(|o| o.pair).collect();
     found.sort_by_key(|pair| (std::cmp::Reverse(pair.expected), pair.photos));
     found
 }
 
-/// Pairs of photographs that share next to nothing, though by their poses they see the same, those with most expected points first.
+/// Pairs of photographs that share next to nothing although their poses say that they see the same part of the scene, most expected
+/// points first.
 pub fn absent(photos: &[PhotoInfo], model: &Model) -> Vec<Absent> {
     absent_of(&overlaps(photos, model))
 }
 
-/// `[photos]` some of the points of each photograph.
+/// `[photos]` at most [`POINTS`] of the points of each photograph, evenly selected.
 fn points_of_photos(model: &Model, photos: usize) -> Vec<Vec<usize>> {
     let mut seen = vec![Vec::new(); photos];
     for (i, point) in model.points.iter().enumerate() {
@@ -80,8 +82,8 @@ fn points_of_photos(model: &Model, photos: usize) -> Vec<Vec<usize>> {
     seen
 }
 
-/// How many points of photograph `a` are matched in `b`, and how many should be; `None` if `b` shows another part of the scene, or from
-/// another side.
+/// How many points of photograph `a` are matched in `b`, and how many should be; `None` if `b` shows another part of the scene, or the
+/// same part from another side.
 fn expected(photos: &[PhotoInfo], model: &Model, seen: &[Vec<usize>], a: usize, b: usize) -> Option<[usize; 2]> {
     let (from, to) = (model.poses[a]?, model.poses[b]?);
     let camera = model.cameras[photos[b].group]?;

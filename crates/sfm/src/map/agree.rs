@@ -1,4 +1,4 @@
-//! Which pairs agree with a model: a scene with parts that look alike may be folded, and the pairs across the fold tell.
+//! Agreement of pairs with a model: parts of a scene that look alike may fold the model, and the pairs across the fold reveal it.
 
 use super::types::{Model, PhotoInfo, VerifiedPair};
 use crate::Features;
@@ -9,22 +9,22 @@ use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 use std::collections::BTreeSet;
 
-/// Matches of a pair that are looked at.
+/// Maximum number of matches of a pair that are examined.
 const MATCHES: usize = 100;
-/// Largest error of a match that agrees, on the plane z = 1: about eight pixels at the usual focal length.
+/// Maximum error of a match that agrees, on the plane z = 1: about eight pixels at the usual focal length.
 const AGREES: f64 = 0.01;
-/// Fraction of the matches of a pair below which it contradicts the model.
+/// A pair contradicts the model if less than this fraction of its matches agree.
 pub(super) const CONTRADICTS: f64 = 0.3;
-/// Distance of two cameras, in units of the model, below which their pair only turns.
+/// Distance between two cameras, in units of the model, below which their pair only turns.
 const BASELINE: f64 = 0.003;
-/// Partners of a photograph, the strongest, that are its neighbours: what looks alike shares less than what is the same.
+/// Number of a photograph's strongest partners that are its neighbours: parts that only look alike share less than one part does.
 const NEIGHBOURS: usize = 3;
-/// Cells along the long side of a picture in which matches are counted once.
+/// Number of cells along the long side of a photograph; each cell with matches counts once.
 const CELLS: f32 = 16.0;
-/// Matches of neighbours that tell.
+/// Minimum number of matches for neighbours to count as evidence.
 const TELLS: usize = 30;
 
-/// The fraction of the matches of each pair that agree with a model; `None` where it does not tell.
+/// `[pairs]` the fraction of the matches of each pair that agree with a model; `None` if a photograph is not in the model.
 pub fn agreement(
     photos: &[PhotoInfo],
     features: &[Features],
@@ -53,7 +53,7 @@ pub fn agreement(
         let essential = motion.essential();
         let agrees = |p: &&[DVec2; 2]| {
             sampson_squared(&essential, **p) < AGREES * AGREES
-                // Far points are as likely just behind as in front: both rays must point the same way.
+                // Distant points may be triangulated just behind the cameras, so only the rays are tested: both must point the same way.
                 && (rotation * p[0].extend(1.0)).dot(p[1].extend(1.0)) > 0.0
         };
         Some(points.iter().filter(agrees).count() as f64 / points.len().max(1) as f64)
@@ -74,8 +74,8 @@ pub(crate) fn on_planes(pair: &VerifiedPair, features: &[Features], cameras: [&D
         .collect()
 }
 
-/// `[pairs]` how strong each pair is: the part of the pictures that its matches cover, by that of the third-best pair of the
-/// less covered of its photographs; 1 and more for neighbours. A label that occurs twice has many matches, but on a small part.
+/// `[pairs]` the strength of each pair: the area that its matches cover, relative to that of the third-best pair of whichever of its
+/// photographs is less covered; 1 or more for neighbours. A label that occurs twice has many matches, but on a small area.
 pub fn strengths(photos: &[PhotoInfo], features: &[Features], pairs: &[VerifiedPair]) -> Vec<f64> {
     let covered: Vec<usize> = pairs.par_iter().map(|pair| covered(photos, features, pair)).collect();
     let mut of_photo: Vec<Vec<usize>> = vec![Vec::new(); photos.len()];
@@ -97,7 +97,7 @@ pub fn strengths(photos: &[PhotoInfo], features: &[Features], pairs: &[VerifiedP
         .collect()
 }
 
-/// Cells with a match in the photograph where they are fewer.
+/// Number of cells with a match, in the photograph that has fewer of them.
 fn covered(photos: &[PhotoInfo], features: &[Features], pair: &VerifiedPair) -> usize {
     let of_side = |side: usize| {
         let photo = pair.photos[side] as usize;
@@ -111,12 +111,12 @@ fn covered(photos: &[PhotoInfo], features: &[Features], pair: &VerifiedPair) -> 
     of_side(0).min(of_side(1))
 }
 
-/// Indices of the pairs of neighbours with enough matches to tell.
+/// Indices of the pairs of neighbours with enough matches to count as evidence.
 pub fn telling(pairs: &[VerifiedPair], strengths: &[f64]) -> impl Iterator<Item = usize> {
     (0..pairs.len()).filter(|i| pairs[*i].matches.len() >= TELLS && strengths[*i] >= 1.0)
 }
 
-/// Neighbours whose matches contradict the model, those with most matches first: where it is folded.
+/// Indices of the neighbours whose matches contradict the model, most matches first: these pairs are across a fold.
 pub fn contradictions(pairs: &[VerifiedPair], strengths: &[f64], agreement: &[Option<f64>]) -> Vec<usize> {
     let mut found: Vec<usize> = telling(pairs, strengths)
         .filter(|i| agreement[*i].is_some_and(|a| a < CONTRADICTS))
@@ -125,14 +125,14 @@ pub fn contradictions(pairs: &[VerifiedPair], strengths: &[f64], agreement: &[Op
     found
 }
 
-/// Indices of pairs, those of greater strength first.
+/// Indices of pairs, strongest first.
 pub(super) fn strongest_first(strengths: &[f64]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..strengths.len()).collect();
     order.sort_by(|a, b| strengths[*b].total_cmp(&strengths[*a]).then(a.cmp(b)));
     order
 }
 
-/// The strongest pairs that join all photographs, without loops.
+/// The spanning tree of the strongest pairs.
 pub fn spanning_tree(photos: usize, pairs: &[VerifiedPair], strengths: &[f64]) -> Vec<usize> {
     let mut order = strongest_first(strengths);
     let mut part: Vec<u32> = (0..photos as u32).collect();
@@ -146,7 +146,7 @@ pub fn spanning_tree(photos: usize, pairs: &[VerifiedPair], strengths: &[f64]) -
     order
 }
 
-/// `[pairs]` whether at most `hops` pairs of `tree` join both photographs of each pair.
+/// `[pairs]` whether the photographs of each pair are connected by at most `hops` pairs of `tree`.
 pub fn near_in_tree(photos: usize, pairs: &[VerifiedPair], tree: &[usize], hops: usize) -> Vec<bool> {
     let mut near: Vec<BTreeSet<usize>> = (0..photos).map(|photo| BTreeSet::from([photo])).collect();
     for _ in 0..hops {

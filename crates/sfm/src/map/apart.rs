@@ -1,9 +1,9 @@
-//! Parts of a scene that were taken for one another, told by matches that are absent, are mapped apart.
+//! Separate mapping of the parts of a scene that were mistaken for one another, which absent matches reveal.
 //!
-//! Photographs of one part hang together by their strongest pairs, and what looks alike joins the parts by weaker ones. So parts are grown
-//! from the strongest pairs on, and those are not joined of which many pairs should share points and do not. After Heinly, Dunn and Frahm,
-//! "Correcting for duplicate scene structure in sparse 3D reconstruction" (ECCV 2014), who split a model by what is seen and
-//! should not be.
+//! Photographs of one part are connected by their strongest pairs, while parts that look alike are connected by weaker ones. Parts are
+//! therefore grown starting with the strongest pairs, and two parts are not joined if many pairs between them should share points and do
+//! not. After Heinly, Dunn and Frahm, "Correcting for duplicate scene structure in sparse 3D reconstruction" (ECCV 2014), who split a
+//! model by structure that is visible and should not be.
 
 use super::absent::{ABSENT_PAIRS, Overlap, absent, absent_of, overlaps};
 use super::agree::{strengths, strongest_first};
@@ -11,25 +11,25 @@ use super::types::{Absent, Model, Progress, VerifiedPair};
 use super::{Grown, Input, grown};
 use std::collections::BTreeMap;
 
-/// Fraction of the pairs between two parts that should share points and do not, from which on the parts are not the same.
+/// Two parts are different if at least this fraction of the pairs between them that should share points do not.
 const APART: f64 = 0.25;
-/// Photographs that the models must hold together, of those before.
+/// Minimum number of photographs in all models of the parts, relative to the number before.
 const KEEPS: f64 = 0.9;
-/// Rounds in which photographs move to other parts.
+/// Maximum number of rounds in which photographs move to other parts.
 const ROUNDS: usize = 10;
 
-/// What became of a model in which matches are absent.
+/// The result of splitting a model in which matches are absent.
 pub(super) struct Parted {
-    /// Models of the parts, or what there was.
+    /// Models of the parts, or the original ones.
     pub found: Grown,
-    /// What was absent before.
+    /// The pairs that were absent before.
     pub absent: Vec<Absent>,
-    /// Models of the parts, if there are such.
+    /// Number of models of the parts, if the model was split.
     pub apart: Option<usize>,
 }
 
-/// Models of the parts, where photographs of `found` should share points and do not, and those of the parts have at most half as many such
-/// pairs; else `found`.
+/// Models of the parts, if photographs of `found` should share points and do not, and the models of the parts have at most half as many
+/// such pairs; else `found`.
 pub(super) fn parted(input: &Input, found: Grown, progress: &mut dyn FnMut(Progress)) -> Parted {
     let Input {
         photos,
@@ -63,11 +63,12 @@ pub(super) fn parted(input: &Input, found: Grown, progress: &mut dyn FnMut(Progr
     }
 }
 
-/// `[photos]` the part of each photograph: joined by pairs, strongest first, unless [`APART`] of what should overlap between two parts does
-/// not. Then each photograph moves to the part to which its pairs are strongest: a chain of few pairs may have pulled it away.
+/// `[photos]` the part of each photograph. Parts are joined by pairs, strongest first, unless the fraction [`APART`] of the pairs between
+/// them that should share points do not. Then each photograph moves to the part with which its pairs are strongest: a chain of a few pairs
+/// may have pulled it away.
 fn parts(photos: usize, pairs: &[VerifiedPair], strengths: &[f64], overlaps: &[Overlap]) -> Vec<usize> {
     let order = strongest_first(strengths);
-    // Between two photographs, then parts, [absent, all] pairs that should share points.
+    // Pairs between two photographs, later between two parts, that should share points: [absent, all].
     let mut single = vec![[0u32; 2]; photos * photos];
     for overlap in overlaps {
         let [a, b] = overlap.pair.photos.map(|p| p as usize);

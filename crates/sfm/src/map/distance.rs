@@ -1,11 +1,11 @@
-//! Metres from known distances between cameras.
+//! Metric scale from known distances between cameras.
 
 use super::types::{Model, PhotoInfo};
 use crate::geometry::align::Alignment;
 use crate::geometry::linear::solve_spd;
 use glam::{DQuat, DVec3};
 
-/// Mean length of a two-dimensional error, by the deviation of each coordinate: the square root of half of pi.
+/// Mean length of a two-dimensional error relative to the standard deviation of each coordinate: the square root of pi / 2.
 const MEAN_LENGTH: f64 = 1.253_314_137_315_5;
 
 /// A known distance between two cameras.
@@ -17,18 +17,18 @@ pub struct Distance {
     pub metres: f64,
 }
 
-/// How well distances and a model agree.
+/// How well a model agrees with known distances.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DistanceFit {
-    /// Root mean square of the differences between distances and the model, m.
+    /// Root mean square of the differences between the known distances and the model's, m.
     pub residual_m: f64,
-    /// Relative standard deviation of the scale: what the poses contribute, and what the distances do if there are several.
+    /// Relative standard deviation of the scale, due to the poses and, if there are several distances, to their differences.
     pub scale_error: f64,
 }
 
-/// Brings `model` to metres, about its origin: the sum of its distances becomes that of the known ones, so that long ones count more.
+/// Scales `model` to metres about its origin: the sum of its distances becomes that of the known ones, so long distances count more.
 ///
-/// `None`, and nothing changes, if a photograph has no pose, or the cameras are at one place as far as can be told.
+/// `None`, and nothing changes, if a photograph has no pose or the cameras cannot be told to be at different places.
 pub fn to_distances(model: &mut Model, photos: &[PhotoInfo], distances: &[Distance]) -> Option<DistanceFit> {
     let (mut metres, mut units, mut variance) = (0.0, 0.0, 0.0);
     let mut lengths = Vec::new();
@@ -46,7 +46,7 @@ pub fn to_distances(model: &mut Model, photos: &[PhotoInfo], distances: &[Distan
         lengths.push(between.length());
     }
     let scale = metres / units;
-    // More than half of the distance could be noise.
+    // Otherwise more than half of the distance could be noise.
     if !(scale.is_finite() && scale > 0.0) || variance.sqrt() > 0.5 * units {
         return None;
     }
@@ -56,7 +56,7 @@ pub fn to_distances(model: &mut Model, photos: &[PhotoInfo], distances: &[Distan
         .map(|(distance, length)| (distance.metres - scale * length).powi(2))
         .sum();
     let n = distances.len() as f64;
-    // The sum of n differences, of which one is spent on the scale.
+    // The variance of the sum of n differences; one degree of freedom is spent on the scale.
     let scatter = if distances.len() > 1 {
         squares * n / (n - 1.0)
     } else {
@@ -79,8 +79,8 @@ pub fn to_distances(model: &mut Model, photos: &[PhotoInfo], distances: &[Distan
     })
 }
 
-/// Variance of a camera's position along a direction, units of the model squared: from the reprojection errors of its points, which are
-/// taken as exact. `None` if its points do not determine its pose.
+/// Variance of a camera's position along a direction, in squared units of the model, from the reprojection errors of its points, whose
+/// positions are assumed to be exact. `None` if its points do not determine its pose.
 fn position_variance(model: &Model, photos: &[PhotoInfo], photo: usize, along: DVec3) -> Option<f64> {
     let pose = model.poses[photo].as_ref()?;
     let camera = model.cameras[photos[photo].group].as_ref()?;
@@ -93,7 +93,7 @@ fn position_variance(model: &Model, photos: &[PhotoInfo], photo: usize, along: D
             continue;
         }
         for row in camera.project(p).by_point {
-            // A shift of the camera moves the point the other way, a turn moves it about the camera.
+            // A shift of the camera moves the point in the opposite direction, a turn rotates it about the camera.
             let [shift, turn] = [-(from_world.transpose() * row), p.cross(row)];
             let row = [shift.x, shift.y, shift.z, turn.x, turn.y, turn.z];
             for i in 0..6 {

@@ -1,4 +1,4 @@
-//! What is handed out: an upright, centred model, and a reason for each photograph that is in none.
+//! The final result: an upright, centred model, and a reason for each photograph that is in no model.
 
 use super::model::Working;
 use super::types::{LeftOut, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, Reason, VerifiedPair};
@@ -8,7 +8,7 @@ use crate::upright::{survey, up};
 use crate::{Features, PairMatches, median};
 use glam::{DQuat, DVec3};
 
-/// The model in a world of its own.
+/// The model in its final, upright world.
 pub(super) fn finish(working: &Working, photos: &[PhotoInfo]) -> Model {
     let mut model = collected(working, photos);
     let alignment = upright(&model, photos);
@@ -57,7 +57,7 @@ pub(super) fn collected(working: &Working, photos: &[PhotoInfo]) -> Model {
     model
 }
 
-/// Up is +Z, the points' median is the origin, and the cameras' median distance from it is 1.
+/// The alignment to a world in which +Z is up, the points' median is the origin and the cameras' median distance from it is 1.
 fn upright(model: &Model, photos: &[PhotoInfo]) -> Alignment {
     let cameras = photos.iter().zip(&model.poses);
     let held = || up(cameras.filter_map(|(photo, pose)| Some((pose.as_ref()?.rotation, photo.up))));
@@ -86,7 +86,7 @@ fn upright(model: &Model, photos: &[PhotoInfo]) -> Alignment {
     }
 }
 
-/// Why photographs are in no model.
+/// Photographs that are in no model, with the reasons.
 pub(super) fn left_out(
     photos: &[PhotoInfo],
     features: &[Features],

@@ -1,8 +1,8 @@
-//! Cameras whose lens is a fisheye, which no metadata tell.
+//! Detection of cameras with a fisheye lens, which is not in the metadata.
 //!
-//! Under a perspective lens, a fisheye of 120 degrees and more bends by more than two radial coefficients can follow: the middle of the pictures is posed
-//! to a few degrees, and what is near the rim is dropped. An adjustment of the same observations with a fisheye then has a much lower cost, and the
-//! scene is mapped again with it.
+//! Two radial coefficients of a perspective lens cannot model the distortion of a fisheye of 120 degrees and more: the poses, from the
+//! centre of the photographs, are off by a few degrees, and observations near the rim are dropped. An adjustment of the same observations
+//! with a fisheye lens then has a much lower cost, and the scene is mapped again with it.
 
 use super::readjust;
 use super::types::{Model, PhotoInfo};
@@ -10,14 +10,14 @@ use crate::Features;
 use crate::adjust::{AdjustedCamera, Focal, Freedom};
 use crate::geometry::camera::DCamera;
 
-/// Focal length in long sides above which no fisheye is tried: that of 71 degrees along the long side.
+/// Focal length, relative to the long side, above which no fisheye is tried: it is that of a 71 degree field of view along the long side.
 const WIDE: f64 = 0.7;
-/// The cost with a fisheye by that with a perspective lens, at most: 0.52 and 0.81 where a lens is a fisheye, 1.85 where it is not.
+/// Maximum cost with a fisheye relative to that with a perspective lens: 0.52 and 0.81 for fisheye lenses, 1.85 for another lens.
 const BETTER: f64 = 0.9;
-/// Photographs that determine a lens, at least.
+/// Minimum number of photographs to determine a lens.
 const LEAST: usize = 5;
 
-/// The cameras of a model that are rather fisheyes: groups, and the cameras that fit.
+/// The groups of a model whose lens is rather a fisheye, each with the camera that fits.
 pub(super) fn find(photos: &[PhotoInfo], features: &[Features], model: &Model) -> Vec<(usize, DCamera)> {
     let is_wide = |camera: &DCamera| camera.focal() < WIDE * camera.long_side();
     let count = |group: usize| {
@@ -53,7 +53,7 @@ pub(super) fn find(photos: &[PhotoInfo], features: &[Features], model: &Model) -
         .collect()
 }
 
-/// `[groups]` the cameras of a model, of which the lenses of `groups` are free.
+/// `[groups]` the cameras of a model; the lenses of `groups` are free, the others are held fixed.
 fn cameras(model: &Model, groups: &[usize], fisheye: bool) -> Vec<AdjustedCamera> {
     let camera = |(group, camera): (usize, &Option<DCamera>)| {
         let camera = camera.unwrap_or(DCamera::centered(1, 1, 1.0));
@@ -70,7 +70,7 @@ fn cameras(model: &Model, groups: &[usize], fisheye: bool) -> Vec<AdjustedCamera
     model.cameras.iter().enumerate().map(camera).collect()
 }
 
-/// The fisheye that shows what is near the axis where the perspective camera does.
+/// The fisheye that projects directions near the axis as the perspective camera does.
 fn as_fisheye(camera: &DCamera) -> DCamera {
     let [fx, fy, cx, cy, ..] = camera.parameters;
     DCamera {

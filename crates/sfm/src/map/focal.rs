@@ -1,4 +1,4 @@
-//! Focal lengths before any adjustment: from metadata, from the pairs, or a common value.
+//! Focal lengths before any adjustment: from metadata, from pairs, or a common value.
 
 use super::types::{MapOptions, PhotoInfo};
 use super::verify::{Cameras, Uncalibrated, centered_points, essential_from, select};
@@ -14,42 +14,47 @@ use rayon::prelude::*;
 pub enum Source {
     /// The photographs' metadata.
     Prior,
-    /// The pairs: it fits their matches best.
+    /// The pairs: the focal length that fits their matches best.
     Pairs,
     /// A common value, 1.2 times the long side.
     Guess,
 }
 
-/// The guess, in long sides (COLMAP's default).
+/// The guess, relative to the long side (COLMAP's default).
 pub(super) const GUESS: f64 = 1.2;
-/// Candidates, in long sides: a field of view of 90 to 8 degrees, in steps of 7 %.
+/// Candidates, relative to the long side: fields of view from 90 down to 8 degrees, in steps of 7 %.
 const FIRST: f64 = 0.5;
 const STEP: f64 = 1.07;
 const CANDIDATES: i32 = 40;
-/// Further candidates, to 126 degrees, where the first of those is the best: 30 photographs of a white tree on a table by a webcam of 116 degrees had a model at 1.1 long sides, all wrong, in
-/// place of 0.31. They are not asked otherwise, since wrong matches fit them as well: those of a box, in a second attempt, 0.4 % better at 0.29 than at 0.8, which is right.
+/// Number of further candidates, up to a field of view of 126 degrees, that are tried if the first of those above is the best: 30
+/// photographs of a white tree on a table by a webcam with a field of view of 116 degrees led to an entirely wrong model at 1.1 long
+/// sides instead of 0.31. They are not tried otherwise, since wrong matches fit them as well: in a second attempt, those of a box fit
+/// 0.4 % better at 0.29 than at the correct 0.8.
 const WIDER: i32 = 10;
-/// The cost at the shortest of all by the lowest, from which on these tell: 1.09 to 2.2 where they are right, 1.01 to 1.07 of turntables and few photographs, which fit any short focal length.
+/// Minimum ratio of the cost at the shortest candidate to the lowest cost for the further candidates to count: 1.09 to 2.2 where they are
+/// right, 1.01 to 1.07 for turntables and few photographs, which any short focal length fits.
 const RISES: f64 = 1.1;
-/// The cost at which metadata are still believed, by the lowest.
+/// Maximum ratio of the cost at the metadata's focal length to the lowest cost for the metadata to be trusted.
 const PRIOR: f64 = 1.25;
-/// Ratio up to which focal lengths of one camera in two models are alike. Two films of a car of bricks, models of 507 and 218 frames: 1.0001 and 1.009.
+/// Ratio up to which the focal lengths of one camera in two models are the same. Two films of a brick car, with models of 507 and 218
+/// frames: 1.0001 and 1.009.
 const ALIKE: f64 = 1.02;
-/// Ratio between a focal length and its first value from which on they are far apart. Frames of a car of bricks: the pairs say 0.6 long sides; right models end at 1.0, wrong
-/// ones, flat and far away, at 3 to 8.
+/// Ratio between a focal length and its initial value above which they are far apart. For frames of a brick car, the pairs say 0.6 long
+/// sides; correct models end at 1.0, wrong ones, flat and far away, at 3 to 8.
 const FAR: f64 = 3.0;
-/// Pairs that vote, those with most inliers, and points of each.
+/// Maximum number of pairs that vote, those with most inliers.
 const VOTERS: usize = 40;
-/// Pairs among which voters are found when all photographs have metadata.
+/// Number of pairs from which voters are selected when all photographs have metadata.
 pub(super) const ENOUGH: usize = 120;
+/// Maximum number of points of each pair that votes.
 const POINTS: usize = 300;
 
-/// Whether two models found one focal length, px, for a camera.
+/// Whether two models found the same focal length for a camera, px.
 pub(super) fn are_alike(a: f64, b: f64) -> bool {
     a.max(b) < ALIKE * a.min(b)
 }
 
-/// Whether a focal length, px, ended far from where it began.
+/// Whether a focal length ended far from where it began, px.
 pub(super) fn are_far(a: f64, b: f64) -> bool {
     a.max(b) > FAR * a.min(b)
 }
@@ -78,7 +83,7 @@ pub(super) fn cameras(
                 vote(group, photos, features, pairs, uncalibrated, prior, options),
             ) {
                 (Some(prior), None) => (prior, Source::Prior),
-                // Metadata of a picture that was cropped or scaled later are wrong.
+                // The metadata of a photograph that was cropped or scaled later are wrong.
                 (_, Some(focal)) => (focal, Source::Pairs),
                 (None, None) => (GUESS, Source::Guess),
             };
@@ -88,11 +93,11 @@ pub(super) fn cameras(
         .collect()
 }
 
-/// The focal length, in long sides, at which essential matrices fit the pairs of a group best; `None` if all fit alike, or if
-/// `prior` fits nearly as well.
+/// The focal length, relative to the long side, at which essential matrices fit the pairs of a group best; `None` if all fit equally
+/// well, or if `prior` fits nearly as well.
 ///
 /// Each pair's fundamental matrix gives an essential matrix for each candidate, which is refined on the pair's inliers; the
-/// candidate with the lowest sum of MSAC costs wins. Pairs that any focal length fits (planes, turns) add the same to all.
+/// candidate with the lowest sum of MSAC costs wins. Pairs that any focal length fits (planes, turns) add the same cost to all.
 fn vote(
     group: usize,
     photos: &[PhotoInfo],
@@ -108,7 +113,7 @@ fn vote(
         .filter(|u| u.count >= 30 && pairs[u.pair].photos.iter().all(|p| photos[*p as usize].group == group))
         .collect();
     voters.sort_by_key(|u| (std::cmp::Reverse(u.count), u.pair));
-    // Neighbours have most inliers but the least parallax: every third of the better half.
+    // Neighbours have the most inliers but the least parallax, so the voters are spread evenly over the better half.
     let step = (voters.len() / 2 / VOTERS).max(1);
     let voters: Vec<Voter> = voters
         .into_iter()
@@ -155,7 +160,7 @@ struct Voter {
     matrix: DMat3,
     /// Some of its inliers, centred and divided by the long side.
     points: Vec<[DVec2; 2]>,
-    /// Largest error of what counts, in long sides.
+    /// Maximum error of an inlier, relative to the long side.
     threshold: f64,
 }
 
@@ -174,12 +179,12 @@ impl Voter {
         Self {
             matrix: of.matrix,
             points: points.into_iter().step_by(thin).collect(),
-            // A quarter of the threshold: what is left are errors of the model, not wrong matches.
+            // A quarter of the threshold: the remaining errors are those of the model, not wrong matches.
             threshold: 0.25 * options.max_epipolar_error / f64::from(first.width.max(first.height)),
         }
     }
 
-    /// The mean MSAC cost at a focal length in long sides.
+    /// The MSAC cost at a focal length relative to the long side.
     fn cost(&self, focal: f64) -> f64 {
         let start = motions(essential_from(self.matrix, focal, focal))[0];
         let scaled: Vec<[DVec2; 2]> = self.points.iter().map(|p| p.map(|x| x / focal)).collect();

@@ -1,4 +1,4 @@
-//! The growth of a model from a seed, photograph by photograph.
+//! Growing a model from a seed, photograph by photograph.
 
 use super::focal::{Source, are_alike};
 use super::model::Working;
@@ -12,32 +12,35 @@ use crate::geometry::ransac::{Estimate, Limits};
 use crate::geometry::resection::Resection;
 use glam::{DVec2, DVec3};
 
-/// Seeds tried for one model, and those among which they are selected.
+/// Maximum number of seeds tried for one model, and of candidates from which they are selected.
 const SEEDS: usize = 12;
 const CANDIDATES: usize = 20 * SEEDS;
-/// Fraction of what its photographs show that a model explains, where focal lengths are open. Those that are right explain 0.88 to
-/// 1.00 of six captures cut in ten ways, and 0.74 of a clock with three models; wrong ones 0.06 to 0.67.
+/// Minimum fraction of its photographs' observations that a doubtful model must explain, such as one whose focal lengths are open.
+/// Correct models of six captures, each cropped in ten ways, explain 0.88 to 1.00, and of a clock with three models 0.74; wrong ones
+/// 0.06 to 0.67.
 const EXPLAINED: f64 = 0.8;
-/// Times a photograph is tried before it is given up.
+/// Number of times a photograph is tried before it is given up.
 const TRIES: usize = 3;
-/// Points of a pair of photographs below which it is no seed.
+/// Minimum number of points of a pair of photographs for a seed.
 const SEED_POINTS: usize = 12;
-/// Inliers among the points a photograph shows: those with fewer wait until the others are registered and all is adjusted.
+/// Minimum fraction of inliers among the points that a photograph shows. Photographs with less than the first wait until the others are
+/// registered and everything is adjusted; then the second applies.
 const STRICT: f64 = 0.5;
 const LENIENT: f64 = 0.25;
-/// Focal lengths tried for the first photograph of a camera, by the one it has: steps of 15 %, from 0.5 to 4.8 long sides where that
-/// is a guess. The best must lie between the ends: a wrong pose far away, with a long focal length, has no minimum.
+/// Focal lengths tried for the first photograph of a camera, relative to the current one: steps of 15 %, from 0.5 to 4.8 long sides where
+/// that is a guess. The best must be between the ends: for a wrong pose far away, with a long focal length, there is no minimum.
 const FOCALS: [f64; 17] = [
     0.43, 0.5, 0.57, 0.66, 0.76, 0.87, 1.0, 1.15, 1.32, 1.52, 1.75, 2.0, 2.3, 2.65, 3.05, 3.5, 4.0,
 ];
-/// Rounds of adjustment, filtering and triangulation at the end.
+/// Maximum number of rounds of adjustment, filtering and triangulation at the end.
 const LAST_ROUNDS: usize = 3;
 
 /// The largest model over several seeds among photographs not yet taken; `None` if there is none.
 ///
-/// A seed whose model holds half of what it could reach ends the search. Two photographs with wrong focal lengths may lead to a wrong
-/// model of all, which explains a third of what its photographs show instead of nine tenths: where focal lengths are open, or end far from where they began, the model
-/// must explain most of it as well. So must a model of few photographs: a seed with wrong poses hardly finds others that disagree. `tried` counts failed registrations.
+/// The search ends with a seed whose model has more than half of the photographs it could reach. Two photographs with wrong focal lengths
+/// may lead to a wrong model of all photographs, which explains a third of their observations instead of nine tenths: where focal lengths
+/// are open, or end far from where they began, the model must explain most observations as well. So must a model of few photographs: a
+/// seed with wrong poses hardly finds others that disagree. `tried` counts failed registrations.
 pub(super) fn model<'a>(
     photos: &'a [PhotoInfo],
     cameras: &Cameras,
@@ -51,7 +54,7 @@ pub(super) fn model<'a>(
     let empty = Working::new(photos, cameras, tracks, options);
     let open = empty.has_open_focals();
     let few = photos.len() <= FEW_PHOTOS;
-    // Whether more must be asked of the model.
+    // Whether the model must also explain enough observations.
     let is_doubtful = |model: &Working| open || few || model.is_far_from_first_focals();
     let mut in_doubt = open || few;
     let mut best: Option<(Working, Vec<usize>)> = None;
@@ -61,8 +64,8 @@ pub(super) fn model<'a>(
         if left == 0 {
             break;
         }
-        // It would lead to the same once more. 984 frames of two films of a car of bricks, whose models explain 0.74 of what they show, took all seeds, a minute each, to end as the
-        // second.
+        // Two earlier seeds led to the same model, which contains this seed: it would lead there once more. 984 frames of two films of
+        // a brick car, whose models explain 0.74 of their observations, used up all seeds, a minute each, and ended as the second.
         let holding: Vec<&Outcome> = (outcomes.iter())
             .filter(|outcome| outcome.holds(&pairs[seed]))
             .collect();
@@ -82,8 +85,8 @@ pub(super) fn model<'a>(
         if !grown.start(&pairs[seed]) || !grown.grow(taken, &mut failures, progress) {
             continue;
         }
-        // Where photographs were cut beside their middles, no seed explains more while principal points are held there: fox, each photograph cut at a place
-        // of its own, took all seeds and 88 s to be mapped, and takes 9.
+        // If photographs were cropped off centre, no seed explains more while principal points are held at the centre: fox, with each
+        // photograph cropped at a different position, took all seeds and 88 s to be mapped, and now takes 9 s.
         if open && grown.explained_fraction() <= EXPLAINED {
             let mut free = grown.clone();
             free.free_principal_points();
@@ -119,11 +122,11 @@ pub(super) fn model<'a>(
     Some(best)
 }
 
-/// Where a seed led.
+/// The model to which a seed led.
 struct Outcome {
-    /// `[photos]` which have a pose.
+    /// `[photos]` whether each has a pose.
     posed: Vec<bool>,
-    /// `[groups]` of cameras with photographs; none where they leave no doubt.
+    /// `[groups]` focal lengths of cameras with photographs, px; empty if the model is not in doubt.
     focals: Vec<Option<f64>>,
 }
 
@@ -147,7 +150,7 @@ impl Outcome {
     }
 }
 
-/// Photographs that chains of pairs connect with the seed.
+/// Number of photographs that chains of pairs connect with the seed.
 fn reachable(seed: &VerifiedPair, pairs: &[VerifiedPair], taken: &[bool]) -> usize {
     let mut reached = vec![false; taken.len()];
     reached[seed.photos[0] as usize] = true;
@@ -182,7 +185,7 @@ impl Working<'_> {
         self.point_count() >= SEED_POINTS
     }
 
-    /// Registers photographs as long as that succeeds, then adjusts all; `false` if the model broke.
+    /// Registers photographs as long as that succeeds, then adjusts everything; `false` if the model is left with too few photographs.
     pub(super) fn grow(&mut self, taken: &[bool], failures: &mut [usize], progress: &mut dyn FnMut(Progress)) -> bool {
         let (mut photos_then, mut points_then) = (self.registered(), self.point_count());
         let mut settled = false;
@@ -196,7 +199,7 @@ impl Working<'_> {
                 if settled {
                     break;
                 }
-                // What failed before may succeed after an adjustment of all.
+                // What failed before may succeed after a global adjustment.
                 self.settle(Extent::Growing, progress);
                 (photos_then, points_then, settled) = (self.registered(), self.point_count(), true);
                 continue;
@@ -222,7 +225,7 @@ impl Working<'_> {
         self.registered() >= self.options.min_model_photos
     }
 
-    /// Adjusts all with the full lens until hardly an observation changes, then to the end.
+    /// Adjusts everything with the full lens until hardly any observation changes, then once more until convergence.
     pub(super) fn settle_fully(&mut self, progress: &mut dyn FnMut(Progress)) {
         for _ in 0..LAST_ROUNDS {
             let changed = self.settle(Extent::Full, progress);
@@ -234,7 +237,7 @@ impl Working<'_> {
         self.settle(Extent::Last, progress);
     }
 
-    /// Adjusts all, filters, triangulates again and removes photographs that lost their points. Returns the number of
+    /// Adjusts everything, filters, triangulates again and removes photographs that lost their points. Returns the number of
     /// observations that changed.
     fn settle(&mut self, extent: Extent, progress: &mut dyn FnMut(Progress)) -> usize {
         self.adjust_all(extent);
@@ -258,7 +261,7 @@ impl Working<'_> {
         changed
     }
 
-    /// Photographs to register, best first: those in which points of the model are many and spread out.
+    /// Photographs to register, best first: those that show many points of the model, spread over the photograph.
     fn candidates(&self, taken: &[bool], failures: &[usize]) -> Vec<usize> {
         let mut scored: Vec<(usize, usize)> = (0..self.poses.len())
             .filter(|p| self.poses[*p].is_none() && !taken[*p] && failures[*p] < TRIES)
@@ -271,8 +274,8 @@ impl Working<'_> {
         scored.into_iter().map(|s| s.1).collect()
     }
 
-    /// How many points of the model a photograph shows, and the pyramid score of Schoenberger and Frahm (2016, 4.2): on
-    /// grids of 2, 4, .. 64 cells a side, each cell with a point counts as many as the grid has.
+    /// How many points of the model a photograph shows, and the pyramid score of Schoenberger and Frahm (2016, 4.2): on grids
+    /// with 2, 4, .. 64 cells per side, each cell that contains a point counts as much as the grid has cells.
     fn visibility(&self, photo: usize) -> (usize, usize) {
         const LEVELS: usize = 6;
         const SIDE: usize = 1 << LEVELS;
@@ -305,7 +308,7 @@ impl Working<'_> {
         (count, score)
     }
 
-    /// Finds the pose of a photograph from the points it shows; `false` if fewer than `ratio` of them agree.
+    /// Finds the pose of a photograph from the points it shows; `false` if less than the fraction `ratio` of them agree.
     fn register(&mut self, photo: usize, ratio: f64) -> bool {
         let seen: Vec<u32> = self.tracks.of_photo[photo]
             .iter()
@@ -343,7 +346,7 @@ impl Working<'_> {
         } else {
             solved(1.0).filter(|(.., found)| agrees(found))
         };
-        // Metadata of a picture that was cut later are wrong.
+        // The metadata of a photograph that was cropped later are wrong.
         if found.is_none() && first {
             let any = FOCALS.into_iter().filter_map(solved);
             let best = any.min_by(|(.., a), (.., b)| a.cost.total_cmp(&b.cost));

@@ -1,7 +1,8 @@
-//! More points of a model whose poses are known, from matches along epipolar lines.
+//! Further points of a model with known poses, from matches along epipolar lines.
 //!
-//! A feature has few neighbours along a line, so that more of them match than among all features of a photograph, and more of these matches are
-//! wrong. A point on which three photographs agree is right; a point of two counts where points beside it, in both, have its depth.
+//! A feature has few candidates along a line, so more features match than among all features of a photograph, and more of these matches
+//! are wrong. A point on which three photographs agree is correct; a point of two photographs is accepted if points beside it, in both
+//! photographs, have a similar depth.
 
 use super::focal::Source;
 use super::model::Working;
@@ -18,23 +19,24 @@ use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 use std::collections::HashSet;
 
-/// Largest distance of a match from its epipolar line, px: the poses are known.
+/// Maximum distance of a match from its epipolar line, px: small, because the poses are known.
 const OFF_LINE: f64 = 1.0;
-/// As [`MatchOptions::ratio`], along lines.
+/// [`MatchOptions::ratio`] for matches along lines.
 const RATIO: f32 = 0.75;
-/// Photographs whose axes are farther apart than this are not matched, degrees.
+/// Maximum angle between the axes of photographs that are matched, degrees.
 const WIDEST: f64 = 70.0;
-/// Photographs that see a point which needs no others beside it.
+/// Minimum number of photographs of a point that is accepted without points beside it.
 const CERTAIN: usize = 3;
-/// Points beside another are within this distance of it, by the photograph's longer side; the nearest of them, and the fewest that tell its depth.
+/// Points beside another are within this distance of it, relative to the photograph's longer side; how many of the nearest ones are used
+/// at most, and how many are needed to predict its depth.
 const BESIDE: f64 = 0.1;
 const NEAREST: usize = 5;
 const FEWEST: usize = 3;
-/// The fraction by which a depth may be outside the range of those beside it.
+/// The fraction by which a depth may be outside the range of the depths beside it.
 const SLACK: f64 = 0.1;
 
-/// Adds points to `model`, which was made of `photos`, `features` and `pairs`. Points that it has give way to those of three photographs or more that share
-/// an observation with them; its cameras and poses stay as they are.
+/// Adds points to `model`, which was made from `photos`, `features` and `pairs`. Existing points are replaced by those of three or more
+/// photographs that share an observation with them; cameras and poses stay as they are.
 ///
 /// # Panics
 /// When `features` and `photos` differ in length, or are not those of `model`.
@@ -45,7 +47,7 @@ pub fn add_guided_points(
     model: &mut Model,
     options: &MapOptions,
 ) {
-    assert_eq!(photos.len(), features.len(), "one set of features a photograph");
+    assert_eq!(photos.len(), features.len(), "one set of features per photograph");
     let guided = guided_pairs(photos, features, model);
     let tracks = Tracks::complete(features, &[&guided, pairs].concat());
     // Groups without a camera have no photograph in the model.
@@ -64,7 +66,7 @@ pub fn add_guided_points(
     model.points.extend(new);
 }
 
-/// Those of `more` whose observations are none of those of `points`.
+/// Those of `more` that share no observation with `points`.
 fn unseen(points: &[ModelPoint], more: Vec<ModelPoint>) -> Vec<ModelPoint> {
     let seen: HashSet<&(u32, u32)> = points.iter().flat_map(|point| &point.track).collect();
     more.into_iter()
@@ -72,7 +74,7 @@ fn unseen(points: &[ModelPoint], more: Vec<ModelPoint>) -> Vec<ModelPoint> {
         .collect()
 }
 
-/// A photograph of the model as a pinhole shows it.
+/// A photograph of the model as if taken by a pinhole camera.
 struct Ideal {
     photo: u32,
     pose: DPose,
@@ -85,7 +87,7 @@ impl Ideal {
     fn new(photo: usize, features: &Features, camera: &DCamera, pose: DPose) -> Self {
         let [fx, fy, cx, cy, ..] = camera.parameters;
         let place = |keypoint: &Keypoint| {
-            // What no pinhole shows is far from all lines.
+            // Keypoints that no pinhole camera shows are moved far away from all lines.
             let at = camera.unproject(keypoint.at()).unwrap_or(DVec2::splat(1e6));
             Keypoint {
                 x: (at.x * fx + cx) as f32,
@@ -112,7 +114,7 @@ impl Ideal {
     }
 }
 
-/// The matches along epipolar lines of all pairs of the model's photographs that look in similar directions, in front of both.
+/// The matches along epipolar lines, in front of both cameras, of all pairs of the model's photographs that look in similar directions.
 fn guided_pairs(photos: &[PhotoInfo], features: &[Features], model: &Model) -> Vec<VerifiedPair> {
     let ideal = |photo: usize| {
         let camera = model.cameras[photos[photo].group].as_ref()?;
@@ -133,7 +135,7 @@ fn guided_pairs(photos: &[PhotoInfo], features: &[Features], model: &Model) -> V
         .collect()
 }
 
-/// `None` for photographs taken from one place, or in directions that differ too much.
+/// The matches of one pair; `None` for photographs taken from one place, or in directions that differ too much.
 fn guided_pair([a, b]: [&Ideal; 2], options: &MatchOptions) -> Option<VerifiedPair> {
     let [toward_a, toward_b] = [a, b].map(|photo| photo.pose.rotation * DVec3::Z);
     if toward_a.dot(toward_b) < WIDEST.to_radians().cos() {
@@ -156,12 +158,12 @@ fn guided_pair([a, b]: [&Ideal; 2], options: &MatchOptions) -> Option<VerifiedPa
         matches,
         kind: PairKind::General,
         motion,
-        // Of the axes: tracks ask for matches only.
+        // The angle between the axes: tracks only use the matches.
         angle: toward_a.angle_between(toward_b),
     })
 }
 
-/// `[photos]` where each shows points of the model, px, and their depths.
+/// `[photos]` the positions at which each shows points of the model, px, and their depths.
 fn known_depths(photos: &[PhotoInfo], features: &[Features], model: &Model) -> Vec<Vec<(DVec2, f64)>> {
     let mut depths = vec![Vec::new(); photos.len()];
     for point in &model.points {
@@ -173,7 +175,7 @@ fn known_depths(photos: &[PhotoInfo], features: &[Features], model: &Model) -> V
     depths
 }
 
-/// Where a photograph shows `point`, px, and its depth.
+/// The position at which a photograph shows `point`, px, and its depth.
 fn seen_at(
     point: &ModelPoint,
     (photo, keypoint): (u32, u32),
@@ -185,7 +187,7 @@ fn seen_at(
     Some((at, pose.camera_from_world(point.position).z))
 }
 
-/// Whether the depth of `point` is that of what is beside it in each photograph.
+/// Whether the depth of `point` is within the range of the points beside it in each photograph.
 fn agrees(
     point: &ModelPoint,
     photos: &[PhotoInfo],

@@ -1,4 +1,4 @@
-//! Metres from the places that the photographs' metadata tell.
+//! Metric scale from the locations in the photographs' metadata.
 
 use super::types::Model;
 use crate::geometry::align::{Alignment, align};
@@ -6,44 +6,47 @@ use crate::geometry::linear::{scatter, symmetric_eigen};
 use crate::median;
 use glam::{DQuat, DVec2, DVec3};
 
-/// Photographs with a place below which there is no scale.
+/// Minimum number of photographs with a location for a scale.
 const LEAST_PHOTOS: usize = 5;
-/// Relative standard deviation of the scale above which it is not used.
+/// Maximum relative standard deviation of a scale that is used.
 const COARSEST: f64 = 0.1;
-/// Distances, in medians of the distances of all photographs, up to which a photograph agrees with a fit.
+/// Maximum distance of a photograph that agrees with a fit, relative to the median distance of all photographs.
 const AGREES: f64 = 3.0;
-/// Photographs of which all pairs are tried.
+/// Maximum number of photographs whose pairs are all tried.
 const MOST_TRIED: usize = 150;
-/// Smallest error of a place that is assumed, m: metadata are rounded.
+/// Minimum assumed error of a location, m: metadata are rounded.
 const LEAST_ERROR_M: f64 = 0.1;
-/// Photographs of which all triples are tried.
+/// Maximum number of photographs whose triples are all tried.
 const MOST_IN_TRIPLES: usize = 20;
-/// Cosine of the angle by which a model is thought not to be upright at least, before its places turn it: photographs tell their up within less.
+/// Cosine of the minimum angle between a model's up and that of its locations for the locations to correct it: the up of photographs is
+/// more accurate than that.
 const TILTED: f64 = 0.866;
-/// How far places reach in their second direction, in standard deviations, at least, to say where up is: of those on a line every turn about it is as good.
+/// Minimum extent of the locations in their second principal direction, in standard deviations, for them to determine up: for locations
+/// on a line, every rotation about it fits equally well.
 const WIDE: f64 = 5.0;
-/// Residual of a model turned by its places by that of the upright one, at most.
+/// Maximum residual of a model rotated by its locations, relative to that of the upright one.
 const BETTER: f64 = 0.5;
 
-/// The scale of a model, and how well it is known.
+/// How well the scale of a model is determined.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Metric {
-    /// Photographs whose places agree.
+    /// Number of photographs whose locations agree.
     pub photos: usize,
-    /// Photographs with a place.
+    /// Number of photographs with a location.
     pub of: usize,
-    /// Root mean square of the horizontal distances between places and the model, m.
+    /// Root mean square of the horizontal distances between the locations and the model, m.
     pub residual_m: f64,
     /// Relative standard deviation of the scale.
     pub scale_error: f64,
 }
 
-/// Brings an upright `model` to metres, with +X east and +Y north, by the `places` of its photographs `[photos]`: east, north and up of
-/// any origin, m. Its origin stays. So does up, and heights are not used, since satellites tell them poorly; unless the places show clearly that it is
-/// wrong: what looks straight down, as drones do, has no up of its own, and the ground stands like a wall.
+/// Scales an upright `model` to metres and rotates it so that +X is east and +Y is north, by the locations `places` of its photographs,
+/// `[photos]`: east, north and up relative to any origin, m. Its origin stays. Up stays too, and heights are ignored, since satellite
+/// positioning is poor at them, unless the locations clearly show that up is wrong: photographs that look straight down, as those of
+/// drones do, do not determine up, and the ground may stand like a wall.
 ///
 /// # Errors
-/// When too few photographs have a place (`None`), or the scale is known too poorly: its relative standard deviation.
+/// `None` when too few photographs have a location; when the scale is too uncertain, its relative standard deviation.
 pub fn to_metres(model: &mut Model, places: &[Option<DVec3>]) -> Result<Metric, Option<f64>> {
     let known = model.poses.iter().zip(places);
     let pairs: Vec<(DVec3, DVec3)> = known
@@ -83,7 +86,7 @@ pub fn to_metres(model: &mut Model, places: &[Option<DVec3>]) -> Result<Metric, 
     Ok(metric)
 }
 
-/// The pairs that agree with the one of `fits` that has the least median distance of all; `None` without any.
+/// The pairs that agree with the best of `fits`, the one with the smallest median distance over all pairs; `None` without any fit.
 fn agreeing<P: Copy, F>(pairs: &[P], fits: impl Iterator<Item = F>, off: impl Fn(&F, &P) -> f64) -> Option<Vec<P>> {
     let mut best: Option<(f64, F)> = None;
     for fit in fits {
@@ -97,8 +100,8 @@ fn agreeing<P: Copy, F>(pairs: &[P], fits: impl Iterator<Item = F>, off: impl Fn
     Some(pairs.iter().copied().filter(|pair| off(&best, pair) <= limit).collect())
 }
 
-/// Scale and turn, as a complex number, from pairs (model, metres): the fit of two photographs with the least median distance of all,
-/// then least squares over those that agree with it.
+/// Scale and rotation, as a complex number, from pairs (model, metres): the fit of two photographs with the smallest median distance over
+/// all, then least squares over those that agree with it.
 fn fit(pairs: &[(DVec2, DVec2)]) -> Option<(DVec2, Metric)> {
     let tried: Vec<_> = pairs.iter().step_by(pairs.len().div_ceil(MOST_TRIED)).collect();
     let twos = tried.iter().enumerate().flat_map(|(i, a)| {
@@ -111,7 +114,7 @@ fn fit(pairs: &[(DVec2, DVec2)]) -> Option<(DVec2, Metric)> {
     let squares: f64 = agreeing.iter().map(|pair| distance(&fit, pair).powi(2)).sum();
     let mean = agreeing.iter().map(|pair| pair.1).sum::<DVec2>() / n;
     let spread: f64 = agreeing.iter().map(|pair| (pair.1 - mean).length_squared()).sum();
-    // Two coordinates a photograph, four numbers fitted.
+    // Two coordinates per photograph, four fitted parameters.
     let variance = squares / (2.0 * n - 4.0).max(1.0) + LEAST_ERROR_M * LEAST_ERROR_M;
     let metric = Metric {
         photos: agreeing.len(),
@@ -122,8 +125,9 @@ fn fit(pairs: &[(DVec2, DVec2)]) -> Option<(DVec2, Metric)> {
     (2 * agreeing.len() > pairs.len()).then_some((fit[0], metric))
 }
 
-/// The turn that brings up to +Z where the places, heights included, have it elsewhere: from the similarity of three photographs with the least
-/// median distance of all, and least squares over those that agree with it. `None` where up is as it should be, or open.
+/// The rotation that brings up to +Z if the locations, heights included, contradict the model's up: from the similarity of three
+/// photographs with the smallest median distance over all, then least squares over those that agree with it. `None` if up is correct
+/// or undetermined.
 fn tilt(pairs: &[(DVec3, DVec3)]) -> Option<DQuat> {
     let off = |fit: &Alignment, (from, to): &(DVec3, DVec3)| fit.point(*from).distance(*to);
     let tried: Vec<_> = pairs.iter().step_by(pairs.len().div_ceil(MOST_IN_TRIPLES)).collect();
@@ -171,7 +175,7 @@ mod tests {
     use crate::map::ModelPoint;
     use irradia_scene::Rng;
 
-    /// `count` cameras on a circle of radius 1, and their places where a unit is 20 m and +X is 30 degrees north of east.
+    /// `count` cameras on a circle of radius 1, and their locations, with 20 m per unit and +X 30 degrees north of east.
     fn capture(count: usize, noise_m: f64) -> (Model, Vec<Option<DVec3>>) {
         let mut rng = Rng::new(4, 4);
         let turn = DQuat::from_rotation_z(30f64.to_radians());
@@ -221,7 +225,7 @@ mod tests {
         );
     }
 
-    /// A survey of `rows` x 6 photographs from 40 m above the ground, in a model whose ground is its wall x-z.
+    /// A survey of `rows` x 6 photographs from 40 m above the ground, in a model whose ground is the vertical x-z plane.
     fn survey(rows: usize) -> (Model, Vec<Option<DVec3>>) {
         let mut rng = Rng::new(5, 5);
         let mut model = Model::default();

@@ -1,8 +1,8 @@
-//! From verified matches to cameras and points: the incremental mapper.
+//! The incremental mapper: from matches to cameras and points.
 //!
 //! [`reconstruct`] verifies pairs (`verify`), guesses focal lengths (`focal`), joins matches to tracks (`tracks`) and grows
-//! models from seed pairs (`grow`), adjusting as they grow (`refine`). Matches that stand still while others move are left out (`still`). It depends on nothing but its input: no clock, no
-//! threads, no order of hashing.
+//! models from seed pairs (`grow`), adjusting as they grow (`refine`). Matches that stand still while others move are left out (`still`).
+//! The result depends only on the input, not on clocks, threads or hash order.
 
 mod absent;
 mod agree;
@@ -54,13 +54,14 @@ use apart::Parted;
 use tracks::Tracks;
 use zoom::Focals;
 
-/// Fraction of the photographs below which a model is in doubt, and the focal length, in long sides, with which it is mapped again then. Models of a rendered medal,
-/// 14 degrees wide, are right from 2, 3, 4 and 6, and wrong from 0.5 (by its pairs) to 1.2.
+/// A model with less than this fraction of the photographs is in doubt, and is mapped again with this focal length, relative to the long
+/// side. Models of a rendered medal with a field of view of 14 degrees are correct with initial values of 2, 3, 4 and 6, and wrong from
+/// 0.5 (the value from its pairs) to 1.2.
 const IN_DOUBT: f64 = 0.8;
 const NARROW: f64 = 3.0;
-/// Settings of a zoom that are told apart, beside the first.
+/// Maximum number of zoom settings that are distinguished besides the first.
 const MOST_ZOOMS: usize = 3;
-/// The mean error of a model in which each photograph has its own focal length, by that of the one before, at most.
+/// Maximum mean error of a model in which each photograph has its own focal length, relative to that of the model with shared ones.
 const OWN_ERROR: f64 = 0.8;
 
 /// Cameras, poses and points from matched features.
@@ -77,11 +78,11 @@ pub fn reconstruct(
     options: &MapOptions,
     progress: &mut dyn FnMut(Progress),
 ) -> Reconstruction {
-    assert_eq!(photos.len(), features.len(), "one set of features a photograph");
+    assert_eq!(photos.len(), features.len(), "one set of features per photograph");
     let pairs = &still::without(photos, features, pairs)[..];
     let mut known = known_cameras(photos);
     let mut found = mapped(photos, features, pairs, &known, options, progress);
-    // What pairs tell of few photographs may be wrong, and a model with it as well.
+    // The focal length that the pairs of few photographs suggest may be wrong, and so may a model that starts with it.
     if photos.len() <= FEW_PHOTOS
         && let Some(usual) = usual(photos, &found.cameras)
     {
@@ -100,7 +101,7 @@ pub fn reconstruct(
         && let Some(narrow) = narrow(photos, &found.cameras)
     {
         let again = mapped(photos, features, pairs, &narrow, options, progress);
-        // Parts that look alike join at any focal length.
+        // Parts that look alike are joined with any focal length, so contradictions decide as well.
         let contradicted = |found: &Reconstruction| found.contradictions(photos, features);
         let more = explained(&again) > explained(&found);
         if again.apart.is_none() && more && contradicted(&again) <= contradicted(&found) {
@@ -148,12 +149,12 @@ pub fn reconstruct(
         found = Reconstruction { zooms, ..again };
         grouped = apart;
     }
-    // Of each photograph's own camera, where it has one.
+    // Puts each photograph into the group of its own camera, where it has one.
     found.regroup(&mut grouped);
     if let Some(model) = principal::freed(&grouped, features, &found, options, progress) {
         found.models[0] = model;
     }
-    // What the adjustment made of them.
+    // The focal lengths after adjustment.
     for zoom in &mut found.zooms {
         for (focal, group) in zoom.focals.iter_mut().zip([zoom.of, zoom.group]) {
             *focal = zoom::camera(&found.models, group).map_or(*focal, DCamera::focal);
@@ -162,8 +163,8 @@ pub fn reconstruct(
     found
 }
 
-/// Another mapping with each photograph as a camera of its own, that starts with the focal length of its camera in `found`; `None` if
-/// the errors do not fall by as much as where that is right.
+/// Maps again with each photograph as its own camera, starting with the focal length of its camera in `found`; `None` unless the errors
+/// fall as much as they do where focal lengths really differ.
 fn with_own_focals(
     photos: &[PhotoInfo],
     features: &[Features],
@@ -189,20 +190,20 @@ fn with_own_focals(
     })
 }
 
-/// Cameras of the usual view, if metadata tell nothing of them, and pairs tell another.
+/// Cameras with the usual focal length, if there are no metadata and the pairs suggest another one.
 fn usual(photos: &[PhotoInfo], cameras: &Cameras) -> Option<Vec<Option<(DCamera, Source)>>> {
     let is_guess = cameras.iter().all(|(_, source)| *source == Source::Guess);
     guessed(photos, cameras, focal::GUESS).filter(|_| !is_guess)
 }
 
-/// Cameras of a narrow view, if metadata tell nothing of them: pairs of such photographs fit all focal lengths nearly alike, and a model that starts with a much shorter one
-/// becomes flat, and breaks.
+/// Cameras with a narrow field of view, if there are no metadata: all focal lengths fit the pairs of such photographs nearly equally
+/// well, and a model that starts with a much shorter one becomes flat and breaks.
 fn narrow(photos: &[PhotoInfo], cameras: &Cameras) -> Option<Vec<Option<(DCamera, Source)>>> {
     let shorter = |(camera, _): &(DCamera, Source)| camera.focal() < NARROW / 2.0 * camera.long_side();
     guessed(photos, cameras, NARROW).filter(|_| cameras.iter().all(shorter))
 }
 
-/// `[groups]` cameras of a focal length in long sides, if metadata tell nothing of them.
+/// `[groups]` cameras with the focal length `focal`, relative to the long side, if there are no metadata.
 fn guessed(photos: &[PhotoInfo], cameras: &Cameras, focal: f64) -> Option<Vec<Option<(DCamera, Source)>>> {
     let told = |photo: &PhotoInfo| photo.focal_prior_px.is_some() || photo.camera.is_some();
     if photos.iter().any(told) {
@@ -215,14 +216,14 @@ fn guessed(photos: &[PhotoInfo], cameras: &Cameras, focal: f64) -> Option<Vec<Op
     Some(cameras.iter().map(camera).collect())
 }
 
-/// Whether the largest model found a focal length far from where it began.
+/// Whether a focal length in the largest model ended far from where it began.
 fn is_far_from_first_focals(found: &Reconstruction) -> bool {
     let first = found.models.first().map_or(&[][..], |model| &model.cameras);
     let mut of_both = first.iter().zip(&found.cameras);
     of_both.any(|(camera, (began, _))| camera.is_some_and(|c| focal::are_far(c.focal(), began.focal())))
 }
 
-/// Photographs of the largest model, and what its points explain of them.
+/// Number of photographs and of observations in the largest model.
 fn explained(found: &Reconstruction) -> (usize, usize) {
     let model = found.models.first();
     model.map_or((0, 0), |model| (model.registered(), model.observations()))
@@ -238,7 +239,7 @@ fn known_cameras(photos: &[PhotoInfo]) -> Vec<Option<(DCamera, Source)>> {
     cameras
 }
 
-/// As [`reconstruct`], with the groups as they are and the cameras of some of them.
+/// Like [`reconstruct`], with the given groups, and with the cameras of some of them given.
 fn mapped(
     photos: &[PhotoInfo],
     features: &[Features],
@@ -271,10 +272,11 @@ fn mapped(
     }
 }
 
-/// As [`reconstruct`], of one model that holds what is `known` as it is, in its world: photographs without a pose are registered into it.
+/// Like [`reconstruct`], for one model that keeps what is `known` unchanged, in its world: photographs without a pose are registered in
+/// it.
 ///
 /// # Panics
-/// As [`reconstruct`], and when `known` differs from `photos` in the number of photographs or groups.
+/// Like [`reconstruct`], and when `known` differs from `photos` in the number of photographs or groups.
 pub fn extend(
     photos: &[PhotoInfo],
     features: &[Features],
@@ -283,11 +285,11 @@ pub fn extend(
     options: &MapOptions,
     progress: &mut dyn FnMut(Progress),
 ) -> Reconstruction {
-    assert_eq!(photos.len(), known.poses.len(), "a pose or none a photograph");
+    assert_eq!(photos.len(), known.poses.len(), "a pose or none per photograph");
     let pairs = &still::without(photos, features, pairs)[..];
     let held: Vec<_> = known.cameras.iter().map(|c| c.map(|c| (c, Source::Prior))).collect();
     let (cameras, verified) = verify::verify_with(photos, features, pairs, &held, options, progress);
-    assert_eq!(cameras.len(), known.cameras.len(), "a camera or none a group");
+    assert_eq!(cameras.len(), known.cameras.len(), "a camera or none per group");
     let tracks = Tracks::new(features, &verified);
     let mut working = model::Working::new(photos, &cameras, &tracks, options);
     working.hold(known);
@@ -308,10 +310,11 @@ pub fn extend(
     }
 }
 
-/// `found`, with further photographs in its largest model, which stays as it is: those that `options` register. Its other models stay unless they share photographs with it now.
+/// `found` with further photographs, those that can be registered with `options`, in its largest model, which is otherwise unchanged. Its
+/// other models stay unless they now share photographs with it.
 ///
 /// # Panics
-/// As [`reconstruct`], and when `found` has no model.
+/// Like [`reconstruct`], and when `found` has no model.
 pub fn complete(
     photos: &[PhotoInfo],
     features: &[Features],
@@ -338,17 +341,17 @@ pub fn complete(
     }
 }
 
-/// Models, and what was tried.
+/// Models, and the photographs that are in them or failed.
 struct Grown {
     /// Largest first.
     models: Vec<Model>,
     /// `[photos]` whether a photograph is in a model.
     taken: Vec<bool>,
-    /// `[photos]` failed registrations.
+    /// `[photos]` number of failed registrations.
     tried: Vec<usize>,
 }
 
-/// What models are grown from.
+/// The input from which models are grown.
 struct Input<'a> {
     photos: &'a [PhotoInfo],
     features: &'a [Features],
@@ -358,7 +361,7 @@ struct Input<'a> {
     options: &'a MapOptions,
 }
 
-/// All models from the matches of `pairs`, which may be some of those of `input`.
+/// All models from the matches of `pairs`, which may be a subset of those of `input`.
 fn grown(input: &Input, pairs: &[VerifiedPair], progress: &mut dyn FnMut(Progress)) -> Grown {
     let Input {
         photos,
@@ -381,7 +384,7 @@ fn grown(input: &Input, pairs: &[VerifiedPair], progress: &mut dyn FnMut(Progres
         models.push(model);
     }
     let mut models: Vec<Model> = models.into_iter().map(|model| finish::finish(&model, photos)).collect();
-    // Stable: models of equal size stay in the order of their seeds.
+    // The sort is stable: models of equal size stay in the order of their seeds.
     models.sort_by_key(|model| std::cmp::Reverse(model.registered()));
     Grown { models, taken, tried }
 }

@@ -1,4 +1,4 @@
-//! A model that grows: which photographs have poses, which tracks have points, which observations agree.
+//! The state of a growing model: which photographs have poses, which tracks have points, which observations agree.
 
 use super::focal::Source;
 use super::tracks::Tracks;
@@ -18,19 +18,19 @@ pub(super) struct Working<'a> {
     pub options: &'a MapOptions,
     /// `[groups]` cameras.
     pub cameras: Vec<DCamera>,
-    /// `[groups]` their first focal lengths, px, and where these came from.
+    /// `[groups]` their initial focal lengths, px, and the sources of these.
     pub first_focals: Vec<f64>,
     pub sources: Vec<Source>,
-    /// `[groups]` focal lengths that are held because no value is better than another.
+    /// `[groups]` whether the focal length is held fixed because no value is better than another.
     pub focal_held: Vec<bool>,
-    /// Whether principal points are adjusted, in place of tangential coefficients.
+    /// Whether principal points are adjusted instead of tangential coefficients.
     pub principal_free: bool,
     /// `[photos]` the photographs on the same rig, or the photograph alone.
     pub rigs: Vec<Vec<usize>>,
-    /// `[photos]` and `[groups]` what was known before mapping: poses and cameras that stay as they are.
+    /// `[photos]` and `[groups]` whether the pose or camera was known before mapping and stays as it is.
     pub held_poses: Vec<bool>,
     pub held_cameras: Vec<bool>,
-    /// `[observations]` on the plane z = 1, undistorted by the present cameras; NaN where the lens is not invertible.
+    /// `[observations]` positions on the plane z = 1, undistorted by the current cameras; NaN where the lens is not invertible.
     pub plane: Vec<DVec2>,
     /// `[photos]` poses of registered photographs.
     pub poses: Vec<Option<DPose>>,
@@ -67,7 +67,7 @@ impl<'a> Working<'a> {
         model
     }
 
-    /// Places a photograph, and those on its rig.
+    /// Sets the pose of a photograph, and of those on its rig.
     pub fn place(&mut self, photo: usize, pose: DPose) {
         for i in 0..self.rigs[photo].len() {
             let other = self.rigs[photo][i];
@@ -78,7 +78,7 @@ impl<'a> Working<'a> {
         }
     }
 
-    /// Places a rig, that of the photograph `leader`, by its own pose.
+    /// Sets the pose of the rig of the photograph `leader`.
     pub fn place_rig(&mut self, leader: usize, pose: DPose) {
         let rotation = pose.rotation * self.mount(leader);
         self.place(leader, DPose { rotation, ..pose });
@@ -97,14 +97,14 @@ impl<'a> Working<'a> {
         tracks
     }
 
-    /// Photographs and cameras that are known, with the points that they see.
+    /// Adopts known poses and cameras, which are held fixed, and triangulates the points that they see.
     pub fn hold(&mut self, known: &Known) {
         self.held_poses = known.poses.iter().map(Option::is_some).collect();
         self.held_cameras = known.cameras.iter().map(Option::is_some).collect();
         self.take_poses(&known.poses);
     }
 
-    /// The photographs and cameras of a finished model, to settle it once more.
+    /// Adopts the poses and cameras of a finished model, to settle it once more.
     pub fn resume(&mut self, model: &Model) {
         for (camera, found) in self.cameras.iter_mut().zip(&model.cameras) {
             *camera = found.unwrap_or(*camera);
@@ -114,7 +114,7 @@ impl<'a> Working<'a> {
         self.take_poses(&model.poses);
     }
 
-    /// Lets later adjustments move principal points, in place of tangential coefficients.
+    /// Makes later adjustments move principal points instead of tangential coefficients.
     pub fn free_principal_points(&mut self) {
         self.principal_free = true;
         let held = self.cameras.iter_mut().zip(&self.held_cameras);
@@ -124,7 +124,7 @@ impl<'a> Working<'a> {
         self.undistort();
     }
 
-    /// Poses, with the points that their photographs see.
+    /// Adopts poses, and triangulates the points that their photographs see.
     fn take_poses(&mut self, poses: &[Option<DPose>]) {
         self.poses = poses.to_vec();
         let all: Vec<usize> = (0..self.tracks.len()).collect();
@@ -153,7 +153,7 @@ impl<'a> Working<'a> {
         &self.cameras[self.photos[photo as usize].group]
     }
 
-    /// The view of an observation; `None` if its photograph is not registered or its lens not invertible there.
+    /// The sight of an observation; `None` if its photograph is not registered or its lens is not invertible there.
     pub fn sight(&self, observation: usize) -> Option<Sight> {
         let photo = self.tracks.observations[observation].photo;
         let pose = self.poses[photo as usize].as_ref()?;
@@ -183,7 +183,7 @@ impl<'a> Working<'a> {
         self.points.iter().flatten().count()
     }
 
-    /// Observations that belong to points.
+    /// Number of observations that belong to points.
     pub fn used_count(&self) -> usize {
         self.used.iter().filter(|used| **used).count()
     }
@@ -195,7 +195,7 @@ impl<'a> Working<'a> {
         self.used_count() as f64 / shown.max(1) as f64
     }
 
-    /// Observations of a photograph, and of those on its rig, that belong to points.
+    /// Number of observations in a photograph, and in those on its rig, that belong to points.
     pub fn used_in(&self, photo: usize) -> usize {
         let observations = self.rigs[photo].iter().flat_map(|p| &self.tracks.of_photo[*p]);
         observations.filter(|o| self.used[**o as usize]).count()
@@ -207,7 +207,7 @@ impl<'a> Working<'a> {
         self.used[self.tracks.range(track)].fill(false);
     }
 
-    /// Takes the pose of a photograph and of those on its rig away, and the points that are then seen less than twice.
+    /// Removes the poses of a photograph and of those on its rig, and the points that are then seen less than twice.
     pub fn deregister(&mut self, photo: usize) {
         for i in 0..self.rigs[photo].len() {
             self.take_pose(self.rigs[photo][i]);

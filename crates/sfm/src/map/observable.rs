@@ -1,4 +1,4 @@
-//! Whether a model determines a focal length: with another, it fits worse.
+//! Test whether a model determines a focal length: with another one it fits worse.
 
 use super::readjust;
 use super::types::{Model, PhotoInfo};
@@ -6,21 +6,22 @@ use crate::Features;
 use crate::adjust::{AdjustedCamera, Freedom};
 use crate::geometry::camera::DCamera;
 
-/// What the focal length is multiplied by.
+/// Factors by which the focal length is multiplied.
 const OTHERS: [f64; 2] = [0.9, 1.1];
-/// Fraction by which the cost rises at each, at least. 113 photographs around a bottle on a floor, whose pairs show a plane, and whose focal length is within 2 % of COLMAP's:
-/// 0.18 and 0.16. Ten of a fox's head, of which it is 25 % too large: -0.01 and 0.05.
+/// Minimum fraction by which the cost rises at each. 113 photographs around a bottle on a floor, whose pairs show a plane and whose focal
+/// length is within 2 % of COLMAP's: 0.18 and 0.16. Ten photographs of a fox's head, whose focal length is 25 % too long: -0.01 and
+/// 0.05.
 const WORSE: f64 = 0.01;
 
-/// Whether `model` determines the focal length of the camera of `group`, rather than to follow whatever it is said to be; poses, points and that camera's
-/// radial distortion adapt.
+/// Whether `model` determines the focal length of the camera of `group`, rather than fitting any value equally well; poses, points and
+/// that camera's radial distortion adapt to each value.
 ///
 /// # Panics
 /// When `photos` and `features` are not those of `model`.
 pub fn determines_focal(photos: &[PhotoInfo], features: &[Features], model: &Model, group: usize) -> bool {
     let cost = |ratio: f64| {
         let cameras = model.cameras.iter().enumerate().map(|(of, camera)| {
-            // A group without posed photographs has no views either.
+            // A group without posed photographs has no views, so any camera will do.
             let mut camera = camera.unwrap_or(DCamera::centered(1, 1, 1.0));
             let mut freedom = Freedom::HELD;
             if of == group {

@@ -1,11 +1,13 @@
-//! Principal points away from the middle, as of photographs cut out of larger ones.
+//! Principal points away from the centre, as in photographs cropped from larger ones.
 //!
-//! Held in the middle, they bend a model: focal lengths differ, tangential coefficients stand in for them, and poses are off by degrees. So a finished
-//! model is adjusted twice on some of its observations: with tangential coefficients, and with free principal points in their place. Of sixteen captures as they are, the cost
-//! falls by at most 1.5 % (reflex cameras and ray-traced ones 0.1 %, phones 1 %, whose principal points are up to 1 % of the long side away); by 6 % for squares
-//! cut out of upright photographs, by 9 % for a film by drone, by 6 to 64 % for photographs cut on purpose. There the model is settled once more
-//! with free principal points. Below, they stay where they are: fox's come to within 3 px of those published, but the splats of three phones gain 0.05 dB by it in the
-//! mean, and those of small pictures and narrow views are not told (1 and 0.5 %, 20 px wrong). Free from the start they are worse, where photographs were cut around the middle.
+//! Holding them at the centre bends a model: focal lengths differ, tangential coefficients compensate, and poses are off by degrees. A
+//! finished model is therefore adjusted twice on some of its observations: with tangential coefficients, and with free principal points
+//! instead. For sixteen unmodified captures, the cost falls by at most 1.5 % (reflex and ray-traced cameras 0.1 %; phones, whose
+//! principal points are up to 1 % of the long side away, 1 %), for squares cropped from upright photographs by 6 %, for a film by a drone
+//! by 9 %, and for photographs cropped on purpose by 6 to 64 %. Where it falls enough, the model is settled once more with free principal
+//! points. Otherwise they stay where they are: fox's would come within 3 px of the published ones, but the splats of three phones gain
+//! only 0.05 dB on average, and the principal points of small photographs and narrow views are not determined (1 and 0.5 %, 20 px wrong).
+//! Leaving them free from the start is worse where photographs were cropped around the centre.
 
 use super::finish;
 use super::model::Working;
@@ -16,10 +18,11 @@ use super::types::{MapOptions, Model, PhotoInfo, Progress, Reconstruction};
 use crate::Features;
 use crate::adjust::{AdjustedCamera, Focal, Freedom};
 
-/// Fraction by which the cost falls with free principal points, at least.
+/// Minimum fraction by which the cost falls with free principal points.
 const BETTER: f64 = 0.03;
 
-/// The first model of `found`, whose groups `photos` have, with free principal points; `None` if the middles do, or photographs would be lost.
+/// The first model of `found` with free principal points; `photos` have its groups. `None` if principal points at the centre fit well
+/// enough, or if photographs or observations would be lost.
 pub(super) fn freed(
     photos: &[PhotoInfo],
     features: &[Features],

@@ -1,10 +1,10 @@
-//! A finished model adjusted once more, with other cameras, on some of its observations: whether these fit better tells what the cameras are.
+//! Adjusts a finished model once more with other cameras, on some of its observations, to see whether these cameras fit better.
 
 use super::types::{Model, PhotoInfo};
 use crate::Features;
 use crate::adjust::{AdjustOptions, AdjustedCamera, Loss, Observation, Problem, View};
 
-/// Observations of a photograph, from long tracks, that are adjusted.
+/// Number of observations of each photograph, from long tracks, that are adjusted.
 const ENOUGH: usize = 200;
 
 /// The photographs of `model` with a pose.
@@ -12,7 +12,7 @@ pub(super) fn posed(model: &Model) -> impl Iterator<Item = usize> {
     (0..model.poses.len()).filter(|photo| model.poses[*photo].is_some())
 }
 
-/// The problem of `model` with other cameras; `camera_of` has the index into these of each posed photograph.
+/// The adjustment problem of `model` with other cameras; `camera_of` returns the index of each posed photograph's camera in `cameras`.
 pub(super) fn problem(
     photos: &[PhotoInfo],
     features: &[Features],
@@ -47,14 +47,14 @@ pub(super) fn problem(
     problem
 }
 
-/// How such a problem is solved: to where costs can be compared.
+/// Options for such a problem: it is solved until costs can be compared.
 pub(super) const OPTIONS: AdjustOptions = AdjustOptions {
     loss: Loss::Cauchy(1.0),
     iterations: 40,
     tolerance: 3e-4,
 };
 
-/// Points, those of long tracks first, that give each photograph [`ENOUGH`] observations.
+/// Indices of points, those with long tracks first, that give each photograph at least [`ENOUGH`] observations where possible.
 fn covering(model: &Model, photos: usize) -> Vec<usize> {
     let mut order: Vec<usize> = (0..model.points.len()).collect();
     order.sort_by_key(|i| std::cmp::Reverse(model.points[*i].track.len()));

@@ -1,4 +1,4 @@
-//! Bundle adjustments of a growing model.
+//! Bundle adjustment of a growing model.
 
 use super::focal::{Source, are_far};
 use super::model::Working;
@@ -10,32 +10,32 @@ use crate::geometry::camera::DCamera;
 use crate::geometry::pose::DPose;
 use glam::DVec2;
 
-/// The loss while the model grows and poses may be far off, and the one at the end, which ignores wrong matches more.
+/// The loss while the model grows and poses may be far off, and the final one, which gives wrong matches less weight.
 const GROWING_LOSS: Loss = Loss::SoftL1(1.0);
 const LOSS: Loss = Loss::Cauchy(1.0);
-/// Observations of a photograph, from long tracks, that an adjustment needs while the model grows.
+/// Number of observations of a photograph, from long tracks, that are enough for an adjustment while the model grows.
 const ENOUGH: usize = 300;
 
-/// Registered photographs from which on the focal length of each camera is adjusted, even of one with a single photograph.
+/// Minimum number of registered photographs to adjust the focal length of every camera, even of one with a single photograph.
 const ANCHORED: usize = 5;
 
-/// Squared error, px^2, that one deviation of an intrinsic parameter is worth: that of ten observations off by a
+/// Cost of one standard deviation of an intrinsic parameter, as a squared error, px^2: that of ten observations that are off by one
 /// pixel.
 const BELIEF: f64 = 10.0;
 
-/// How much of the model an adjustment may change.
+/// Which parts of the model an adjustment changes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Extent {
     /// While growing: few points, focal length and one radial coefficient.
     Growing,
     /// All points, the full lens, and the principal point where that is free.
     Full,
-    /// As `Full`, to the end.
+    /// Like `Full`, until convergence.
     Last,
 }
 
 impl Working<'_> {
-    /// Adjusts everything; returns what the adjustment did.
+    /// Adjusts everything.
     pub fn adjust_all(&mut self, extent: Extent) -> AdjustReport {
         let points = self.with_points();
         let chosen = if extent == Extent::Growing {
@@ -84,7 +84,7 @@ impl Working<'_> {
         report
     }
 
-    /// Adjusts a new photograph, its neighbours and its points; all else is held. Photographs on a rig move together.
+    /// Adjusts a new photograph, its neighbours and its points; everything else is held fixed. Photographs on a rig move together.
     pub fn adjust_around(&mut self, photo: usize) {
         let local = self.neighbours(photo);
         let mut variable = vec![false; self.tracks.len()];
@@ -92,7 +92,7 @@ impl Working<'_> {
             let track = self.track_of(*o);
             variable[track] |= self.used[*o as usize] && self.points[track].is_some();
         }
-        // Held points of neighbours anchor them.
+        // Fixed points of neighbours anchor them.
         let mut listed = vec![false; self.tracks.len()];
         let mut tracks = Vec::new();
         for neighbour in &local {
@@ -119,7 +119,7 @@ impl Working<'_> {
             .map(|c| AdjustedCamera::new(*c, Freedom::HELD))
             .collect();
         let group = self.photos[photo].group;
-        // A camera of its own has no other photograph that its adjustment could harm.
+        // The camera is adjusted only if it has no other photograph that this could harm.
         let freedom = if self.registered_of(group) == 1 {
             self.freedom(group, Extent::Growing)
         } else {
@@ -151,7 +151,7 @@ impl Working<'_> {
         self.filter(&tracks);
     }
 
-    /// Whether nothing tells the focal lengths of several cameras.
+    /// Whether there are several cameras whose focal lengths are guesses.
     pub(super) fn has_open_focals(&self) -> bool {
         let open = |group: &usize| self.sources[*group] == Source::Guess && !self.held_cameras[*group];
         (0..self.sources.len()).filter(open).count() > 1
@@ -165,7 +165,7 @@ impl Working<'_> {
             .any(|group| self.registered_of(group) > 0)
     }
 
-    /// Multiplies the focal length of a group.
+    /// Multiplies the focal length of a group by `factor`.
     pub(super) fn scale_focal(&mut self, group: usize, factor: f64) {
         for focal in &mut self.cameras[group].parameters[..2] {
             *focal *= factor;
@@ -173,12 +173,12 @@ impl Working<'_> {
         self.undistort();
     }
 
-    /// The first registered photograph of each rig; a photograph on none leads itself.
+    /// The first photograph of each registered rig; a photograph without a rig is its own leader.
     fn leaders(&self) -> impl Iterator<Item = usize> {
         (0..self.poses.len()).filter(|p| self.poses[*p].is_some() && self.rigs[*p][0] == *p)
     }
 
-    /// Adds the pose of the rig that `leader` leads, and a view for each of its photographs, which `view_of` tells.
+    /// Adds the pose of the rig of `leader` and a view for each of its photographs, whose index is stored in `view_of`.
     fn add_views(&self, problem: &mut Problem, leader: usize, held: bool, view_of: &mut [Option<u32>]) {
         let Some(pose) = self.poses[leader] else { return };
         let number = problem.poses.len() as u32;
@@ -197,7 +197,8 @@ impl Working<'_> {
         }
     }
 
-    /// The leaders of the rig of `photo` and of those that share most points with it, [`MapOptions::local_photos`](super::MapOptions) in all.
+    /// The leaders of the rig of `photo` and of the rigs that share most points with it, at most
+    /// [`MapOptions::local_photos`](super::MapOptions) in total.
     fn neighbours(&self, photo: usize) -> Vec<usize> {
         let leader = |photo: usize| self.rigs[photo][0];
         let mut shared = vec![0usize; self.poses.len()];
@@ -217,7 +218,7 @@ impl Working<'_> {
         order
     }
 
-    /// Adds the points of `tracks` with their used observations; held points only in adjusted photographs.
+    /// Adds the points of `tracks` with their used observations; fixed points only with their observations in adjusted photographs.
     fn add_points(
         &self,
         problem: &mut Problem,
@@ -248,7 +249,7 @@ impl Working<'_> {
         }
     }
 
-    /// Tracks, long ones first, that give each photograph `enough` observations, in their order.
+    /// A subset of `tracks`, long ones preferred, that gives each photograph at least `enough` observations where possible; ascending.
     fn covering(&self, tracks: &[usize], enough: usize) -> Vec<usize> {
         let length = |track: usize| self.tracks.range(track).filter(|o| self.used[*o]).count();
         let mut order: Vec<(usize, usize)> = tracks.iter().map(|t| (length(*t), *t)).collect();
@@ -269,14 +270,14 @@ impl Working<'_> {
         chosen
     }
 
-    /// What of a group's intrinsics is adjusted, by the number of its photographs.
+    /// Which intrinsics of a group are adjusted, depending on the number of its photographs.
     fn freedom(&self, group: usize, extent: Extent) -> Freedom {
         if self.held_cameras[group] {
             return Freedom::HELD;
         }
         let count = self.registered_of(group);
         let full = extent != Extent::Growing && count >= self.options.full_lens_photos;
-        // Others anchor the points of a camera with few photographs.
+        // Other photographs anchor the points of a camera with few photographs.
         let least = match self.sources[group] {
             _ if self.registered() >= ANCHORED => 1,
             Source::Prior => 4,
@@ -290,9 +291,9 @@ impl Working<'_> {
         }
     }
 
-    /// What is believed of a group's camera.
+    /// The prior on a group's camera.
     fn belief(&self, group: usize) -> Belief {
-        // Of several cameras of which nothing tells the focal length, each may have any.
+        // If the focal lengths of several cameras are guesses, each may differ much from the guess.
         let focal = if self.has_open_focals() && self.sources[group] == Source::Guess {
             1.0
         } else {
@@ -301,7 +302,7 @@ impl Working<'_> {
         belief(&self.cameras[group], self.first_focals[group], focal)
     }
 
-    /// Takes an adjusted camera, unless its values are not those of a camera.
+    /// Adopts an adjusted camera if its values are plausible; otherwise its focal length is held fixed from now on.
     fn take_camera(&mut self, group: usize, camera: DCamera) {
         let focal = camera.focal() / camera.long_side();
         let lens = camera.parameters[4..].iter().all(|k| k.abs() < 1.0);
@@ -313,12 +314,12 @@ impl Working<'_> {
     }
 }
 
-/// What of a finished model's camera is adjusted, by the number of its photographs: all but the principal point.
+/// Which intrinsics of a finished model's camera are adjusted, depending on the number of its photographs: all but the principal point.
 pub(super) fn finished(camera: &DCamera, count: usize, focal_held: bool, options: &MapOptions) -> Freedom {
     lens_freedom(camera, count, focal_held, count >= options.full_lens_photos)
 }
 
-/// What of a camera with `count` photographs is adjusted, all that [`DCamera`] has if `full`.
+/// Which intrinsics of a camera with `count` photographs are adjusted: if `full`, all of [`DCamera`] but the principal point.
 fn lens_freedom(camera: &DCamera, count: usize, focal_held: bool, full: bool) -> Freedom {
     Freedom {
         focal: match (focal_held, full) {
@@ -332,14 +333,14 @@ fn lens_freedom(camera: &DCamera, count: usize, focal_held: bool, full: bool) ->
             0..=3 => 0,
             _ => 1,
         },
-        // Those of a fisheye are its k3 and k4, which stay 0.
+        // In a fisheye these are k3 and k4, which stay 0.
         tangential: full && !camera.fisheye,
     }
 }
 
-/// What is known of cameras in general, so that what a set of photographs does not determine stays where it usually is:
-/// square pixels, a weak lens, a focal length within `focal` of the first one, and a principal point within a tenth of the long side of the middle, as of cut
-/// photographs: only where those ask for it is it free.
+/// A prior for cameras in general, which keeps parameters that the photographs do not determine at their usual values: square pixels, a
+/// weak lens, a focal length within the fraction `focal` of the initial one, and a principal point within a tenth of the long side from
+/// the centre, as in cropped photographs; it is free only where these require it.
 pub(super) fn belief(camera: &DCamera, first_focal: f64, focal: f64) -> Belief {
     let long_side = camera.long_side();
     let deviations = [

@@ -1,8 +1,9 @@
-//! The pairs from which models start.
+//! Selection of the pairs from which models start.
 
 use super::types::{PairKind, VerifiedPair};
 
-/// Requirements of a seed, strict ones first: inliers, median angle in degrees, cosine of the largest forward motion.
+/// Requirements of a seed, strictest first: minimum number of inliers, minimum median angle in degrees, maximum forward component of
+/// the unit translation.
 const ROUNDS: [(usize, f64, f64); 5] = [
     (100, 16.0, 0.95),
     (100, 8.0, 0.95),
@@ -11,9 +12,9 @@ const ROUNDS: [(usize, f64, f64); 5] = [
     (15, 1.5, 1.01),
 ];
 
-/// Indices of pairs to start from, the most promising first, at most `count`; photographs already `taken` are avoided.
+/// Indices of at most `count` pairs to start from, the most promising first; photographs already `taken` are avoided.
 ///
-/// In each round pairs are ordered by their inliers, with angles up to twice the required counting in proportion.
+/// In each round, pairs are ordered by their number of inliers times their angle, up to twice the required one.
 pub(super) fn seeds(pairs: &[VerifiedPair], taken: &[bool], count: usize) -> Vec<usize> {
     let mut seeds: Vec<usize> = Vec::new();
     for (inliers, degrees, forward) in ROUNDS {
@@ -30,13 +31,13 @@ pub(super) fn seeds(pairs: &[VerifiedPair], taken: &[bool], count: usize) -> Vec
                     && !seeds.contains(i)
             })
             .map(|(i, pair)| {
-                // A plane fits several motions, some of them wrong: general pairs first.
+                // Several motions fit a plane, some of them wrong: general pairs first.
                 let trust = if pair.kind == PairKind::Planar { 0.3 } else { 1.0 };
                 (trust * pair.matches.len() as f64 * (pair.angle / least).min(2.0), i)
             })
             .collect();
         round.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
-        // Pairs of the same photographs fail together: one seed a photograph and round.
+        // Pairs that share a photograph tend to fail together: one seed per photograph and round.
         let mut seen = vec![false; taken.len()];
         for (_, i) in round {
             let photos = pairs[i].photos.map(|p| p as usize);

@@ -1,8 +1,9 @@
-//! What stands still in the pictures while the rest moves: parts of what carries the camera, writing on the pictures, the background of a turntable.
+//! Detection of what stands still in the photographs while the rest moves: parts of what carries the camera, text laid over the
+//! photographs, the background of a turntable.
 //!
-//! Poses that follow it are those of a camera at rest. So where it is found, its matches are left out, and the poses are those of what moves. Of twelve photographs by a
-//! robot that shows parts of itself, 20 % of the matches stand still: with them three photographs turn by 1.6 degrees instead of 16 to 20, without them all turn as the
-//! robot did, within 0.3 degrees.
+//! Poses that follow it are those of a camera at rest. Where it is found, its matches are therefore left out, and the poses are those
+//! relative to what moves. In twelve photographs by a robot that shows parts of itself, 20 % of the matches stand still: with them three
+//! photographs turn by 1.6 degrees instead of 16 to 20; without them all turn as the robot did, within 0.3 degrees.
 
 use super::types::PhotoInfo;
 use super::verify::{centered_points, seed_of};
@@ -14,39 +15,40 @@ use glam::DVec2;
 use rayon::prelude::*;
 use std::borrow::Cow;
 
-/// Largest shift of a match that stands still, in long sides: keypoints of the same pixels repeat within a pixel.
+/// Maximum shift of a match that stands still, relative to the long side: keypoints of the same pixels repeat within a pixel.
 const STILL: f64 = 0.002;
-/// Least shift of a match that certainly moves, in long sides.
+/// Minimum shift of a match that certainly moves, relative to the long side.
 const MOVES: f64 = 0.015;
-/// Error in long sides at which a match agrees with a geometry: four pixels of a thousand, as in verification.
+/// Maximum error of a match that agrees with a geometry, relative to the long side: four pixels of a thousand, as in verification.
 pub(crate) const AGREES: f64 = 0.004;
-/// Matches that stand still, and their fraction, from which on a pair counts.
+/// Minimum number and fraction of matches that stand still for a pair to count.
 const MATCHES: usize = 12;
 const FRACTION: f64 = 0.08;
-/// Fraction of the pairs from which on it is a fault of the capture.
+/// Minimum fraction of the pairs for a fault of the capture.
 const PAIRS: f64 = 0.1;
 
-/// Fraction of the features, and largest median shift in long sides, of one photograph taken twice.
+/// Minimum fraction of the features that match, and maximum median shift relative to the long side, for photographs taken twice from one
+/// place.
 const SAME_FEATURES: f64 = 0.4;
 const SAME_SHIFT: f64 = 0.001;
-/// Photographs that chains of pairs from the same place join, from which on what is in the same place is no photograph taken twice but a
-/// background that stands still, with more features than what turns before it; in photographs, and as a fraction of all.
+/// Minimum number of photographs, and minimum fraction of all, in a chain of pairs from the same place for it to be a background that
+/// stands still, with more features than the object that turns in front of it, rather than photographs taken twice.
 const CHAIN: usize = 6;
 const CHAIN_FRACTION: f64 = 0.2;
 
-/// That a part of the pictures stands still.
+/// Evidence that a part of the photographs stands still.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StandsStill {
     /// The photographs of each pair that shows it.
     pub pairs: Vec<[u32; 2]>,
-    /// Pairs that were compared.
+    /// Number of pairs that were compared.
     pub compared: usize,
-    /// Median fraction of the matches of these pairs.
+    /// Median fraction of the matches of these pairs that stand still.
     pub fraction: f64,
 }
 
 impl StandsStill {
-    /// The photographs, of so many, in which the same stands still, largest group first; those that show nothing of it are left out.
+    /// Groups of the `photos` photographs in which the same part stands still, largest first; photographs without such a part are left out.
     pub fn groups(&self, photos: usize) -> Vec<Vec<usize>> {
         let mut parts = parts(photos, &self.pairs);
         parts.retain(|part| part.len() > 1);
@@ -54,7 +56,8 @@ impl StandsStill {
     }
 }
 
-/// Whether a part of the pictures stands still while the rest moves by a geometry with which it does not agree, or while nothing that moves is matched.
+/// Whether a part of the photographs stands still while the rest follows a motion with which it does not agree, or while nothing that
+/// moves is matched.
 pub fn stands_still(photos: &[PhotoInfo], features: &[Features], pairs: &[PairMatches]) -> Option<StandsStill> {
     beside_what_moves(photos, features, pairs).or_else(|| alone(photos, features, pairs))
 }
@@ -73,7 +76,8 @@ fn beside_what_moves(photos: &[PhotoInfo], features: &[Features], pairs: &[PairM
     })
 }
 
-/// The fraction of a pair's matches that stands still, if the others move otherwise; `None` if no others tell, as those of opposite sides of a turntable.
+/// The fraction of a pair's matches that stand still, `Some(None)` if they are few or agree with the motion of the others; `None` if the
+/// others are too few or inconsistent, as for opposite sides of a turntable.
 fn fraction(photos: &[PhotoInfo], features: &[Features], pair: &PairMatches) -> Option<Option<f64>> {
     let places = centered_points(photos, features, pair);
     let (still, others): (Vec<_>, Vec<_>) = places.into_iter().partition(stays);
@@ -95,12 +99,12 @@ fn fraction(photos: &[PhotoInfo], features: &[Features], pair: &PairMatches) -> 
         return None;
     }
     let off = |p: &&[DVec2; 2]| sampson_squared(&found.model, **p) > AGREES * AGREES;
-    // Far away or straight ahead, matches stand still and agree.
+    // Matches far away or straight ahead stand still but agree with the motion.
     let disagree = 2 * still.iter().filter(off).count() > still.len();
     Some(disagree.then_some(part))
 }
 
-/// Pairs that show the same from the same place.
+/// Pairs that show the same part of the scene from the same place.
 pub fn same_place(photos: &[PhotoInfo], features: &[Features], pairs: &[PairMatches]) -> Vec<[u32; 2]> {
     let same = |pair: &&PairMatches| {
         let [a, b] = pair.photos.map(|p| features[p as usize].keypoints.len());
@@ -114,7 +118,7 @@ pub fn same_place(photos: &[PhotoInfo], features: &[Features], pairs: &[PairMatc
     pairs.iter().filter(same).map(|pair| pair.photos).collect()
 }
 
-/// The longest chain of pairs from the same place, if it is one of a background that stands still.
+/// The longest chain of pairs from the same place, if it is long enough for a background that stands still.
 fn alone(photos: &[PhotoInfo], features: &[Features], pairs: &[PairMatches]) -> Option<StandsStill> {
     let mut same = same_place(photos, features, pairs);
     let longest = parts(photos.len(), &same).into_iter().next()?;
@@ -126,7 +130,7 @@ fn alone(photos: &[PhotoInfo], features: &[Features], pairs: &[PairMatches]) -> 
     })
 }
 
-/// Photographs that `pairs` join, largest part first.
+/// The connected components of photographs under `pairs`, largest first.
 fn parts(photos: usize, pairs: &[[u32; 2]]) -> Vec<Vec<usize>> {
     let mut partners = vec![Vec::new(); photos];
     for [a, b] in pairs {
@@ -136,7 +140,7 @@ fn parts(photos: usize, pairs: &[[u32; 2]]) -> Vec<Vec<usize>> {
     connected(photos, |photo| partners[photo].iter().copied())
 }
 
-/// `pairs` without the matches that stand still, if a part of the pictures does.
+/// `pairs` without the matches that stand still, if a part of the photographs does.
 pub(super) fn without<'a>(
     photos: &[PhotoInfo],
     features: &[Features],
@@ -161,13 +165,13 @@ pub fn moving(photos: &[PhotoInfo], features: &[Features], pairs: &[PairMatches]
     pairs.iter().map(moving).collect()
 }
 
-/// Photographs of the pairs that have a value.
+/// The photographs of each pair that has a value.
 pub(crate) fn showing<T>(pairs: &[&PairMatches], values: &[Option<T>]) -> Vec<[u32; 2]> {
     let both = pairs.iter().zip(values);
     both.filter(|b| b.1.is_some()).map(|b| b.0.photos).collect()
 }
 
-/// How a geometry is estimated that tells what moves otherwise.
+/// Sampling limits for the estimation of a pair's motion.
 pub(crate) fn limits(pair: &PairMatches, samples: usize) -> Limits {
     Limits {
         samples,

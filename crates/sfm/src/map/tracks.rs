@@ -1,10 +1,10 @@
-//! Tracks: keypoints of different photographs that show the same point, joined from verified matches.
+//! Tracks: keypoints in different photographs that show the same point, joined by verified matches.
 
 use super::types::{PairKind, VerifiedPair};
 use crate::Features;
 use glam::DVec2;
 
-/// Tracks of three photographs or more with which a photograph needs no tracks of two.
+/// A photograph with at least this many tracks over three or more photographs needs no tracks over two.
 const ENOUGH: usize = 200;
 
 /// A keypoint of a track.
@@ -16,26 +16,26 @@ pub struct Observation {
     pub keypoint: u32,
 }
 
-/// All tracks, at most one observation a photograph each.
+/// All tracks; each has at most one observation per photograph.
 #[derive(Clone, Debug, Default)]
 pub struct Tracks {
     /// `[T + 1]` where the observations of each track begin.
     pub starts: Vec<u32>,
-    /// Observations by track, within a track by photograph.
+    /// Observations, sorted by track, within a track by photograph.
     pub observations: Vec<Observation>,
     /// The track of each observation.
     pub track_of: Vec<u32>,
-    /// Pixels of each observation.
+    /// The pixel of each observation.
     pub pixels: Vec<DVec2>,
     /// `[photos]` the observations in each photograph, ascending.
     pub of_photo: Vec<Vec<u32>>,
 }
 
 impl Tracks {
-    /// Joins matches, those of pairs with most matches first; a match that would bring two places of one photograph into
-    /// a track is dropped: it, or one before, is wrong.
+    /// Joins matches, starting with the pairs with most matches; a match that would bring two keypoints of one photograph into
+    /// a track is dropped: it, or an earlier one, is wrong.
     ///
-    /// Tracks of two photographs say least and are wrong most often: only photographs with few others have them.
+    /// Tracks over two photographs contribute least and are wrong most often, so only photographs with few other tracks have them.
     pub fn new(features: &[Features], pairs: &[VerifiedPair]) -> Self {
         let mut tracks = joined(features, pairs);
         let mut longer = vec![0usize; features.len()];
@@ -46,7 +46,7 @@ impl Tracks {
         Self::of(features, tracks)
     }
 
-    /// As [`Self::new`], with all tracks of two photographs.
+    /// Like [`Self::new`], with all tracks over two photographs.
     pub fn complete(features: &[Features], pairs: &[VerifiedPair]) -> Self {
         Self::of(features, joined(features, pairs))
     }
@@ -81,9 +81,9 @@ impl Tracks {
     }
 }
 
-/// The observations of each track, by photograph; tracks in the order of their first.
+/// The observations of each track, sorted by photograph; tracks are in the order of their first observation.
 fn joined(features: &[Features], pairs: &[VerifiedPair]) -> Vec<Vec<Observation>> {
-    // Keypoints at one place (a blob with two orientations) are one.
+    // Keypoints at the same position (a blob with two orientations) are one node.
     let mut first_node = vec![0u32];
     let mut node_of: Vec<Vec<u32>> = Vec::new();
     for features in features {
@@ -106,7 +106,7 @@ fn joined(features: &[Features], pairs: &[VerifiedPair]) -> Vec<Vec<Observation>
     let nodes = *first_node.last().expect("starts with zero") as usize;
     let mut sets = Sets::new(nodes);
     let mut order: Vec<usize> = (0..pairs.len()).collect();
-    // Rotation-only pairs last: their wrong matches are the hardest to notice.
+    // Rotation-only pairs come last: their wrong matches are the hardest to notice.
     order.sort_by_key(|i| {
         let pair = &pairs[*i];
         (
@@ -122,7 +122,7 @@ fn joined(features: &[Features], pairs: &[VerifiedPair]) -> Vec<Vec<Observation>
             sets.join((i, a), (j, b));
         }
     }
-    // Tracks in the order of their first node: members are visited by photograph.
+    // Members are visited by photograph, so tracks are in the order of their first node.
     let nodes = *first_node.last().expect("starts with zero");
     let mut track_of_root = vec![u32::MAX; nodes as usize];
     let mut members: Vec<Vec<Observation>> = Vec::new();
@@ -146,7 +146,7 @@ fn joined(features: &[Features], pairs: &[VerifiedPair]) -> Vec<Vec<Observation>
     members
 }
 
-/// Disjoint sets of nodes that know their photographs.
+/// Disjoint sets of nodes with the photographs of each set.
 struct Sets {
     parent: Vec<u32>,
     /// Per root: photographs, ascending; empty for a single node.
@@ -244,7 +244,7 @@ mod tests {
         ];
         let pairs = [
             pair([0, 1], &[[0, 0], [1, 1]]),
-            // Keypoint 2 of the last photograph is its keypoint 0 in another orientation.
+            // Keypoint 2 of the last photograph is its keypoint 0 with another orientation.
             pair([1, 2], &[[0, 2], [1, 1]]),
             // Would join keypoints 0 and 1 of the first photograph.
             pair([0, 2], &[[1, 0]]),

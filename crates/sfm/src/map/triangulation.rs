@@ -1,4 +1,4 @@
-//! Points of tracks: robust triangulation, completion by further photographs, and removal of what does not fit.
+//! Points of tracks: robust triangulation, completion by further photographs, and removal of outliers.
 
 use super::model::Working;
 use crate::geometry::triangulate::{Sight, cosine_at, midpoint, refine_point};
@@ -6,7 +6,7 @@ use glam::DVec3;
 use irradia_scene::Rng;
 use rayon::prelude::*;
 
-/// Pairs of rays tried for one track: with half of its observations wrong, all fail once in 70.
+/// Number of pairs of rays tried for one track: if half of its observations are wrong, all pairs fail once in 70 times.
 const PAIRS: usize = 15;
 
 impl Working<'_> {
@@ -138,7 +138,7 @@ impl Working<'_> {
         removed
     }
 
-    /// Moves the points of `tracks` to the least squares of their present observations.
+    /// Moves the points of `tracks` to the least-squares solution for their current observations.
     pub fn polish(&mut self, tracks: &[usize]) {
         let moved: Vec<Option<DVec3>> = tracks
             .par_iter()

@@ -1,7 +1,8 @@
-//! Turntables, told by poses: the scene turns about one axis that stands still before the camera.
+//! Detection of turntables by their poses: the scene turns about one axis that stands still in front of the camera.
 //!
-//! A background without texture shows nothing that stands still, and the poses are those of the object all the same. But a camera that is carried around an object never holds
-//! the axis so exactly: in seven captures by hand (21 to 290 photographs) no four photographs share one, of a toy on a turntable 79 of 97 do, at six heights.
+//! A background without texture has no matches that stand still, yet the poses are those relative to the object. But a camera that is
+//! carried around an object never keeps the axis so exactly: in seven captures by hand (21 to 290 photographs) no four photographs share
+//! one, while of a toy on a turntable 79 of 97 do, at six heights.
 
 use super::types::Model;
 use crate::geometry::pose::DPose;
@@ -9,19 +10,20 @@ use glam::DVec3;
 use rayon::prelude::*;
 use std::f64::consts::PI;
 
-/// Photographs of one height, at least, and the part of all that rings of one height must hold together.
+/// Minimum number of photographs in a ring, which is at one height, and minimum fraction of all photographs that are in rings.
 const LEAST: usize = 6;
 const PART: f64 = 0.5;
-/// Turns between two photographs that determine an axis, radians.
+/// Angles of rotation between two photographs that determine an axis, radians.
 const TURN: std::ops::Range<f64> = 8.0 * PI / 180.0..170.0 * PI / 180.0;
-/// How far axes of one ring differ: cosine of the angle between them, and their distance by that from the camera; and the largest shift along an axis by the same.
+/// How much the axes of one ring may differ: cosine of the maximum angle between them, and their maximum distance relative to the
+/// distance from the camera; and the maximum shift along an axis, also relative to that distance.
 const DIRECTION: f64 = 0.99985;
 const PLACE: f64 = 0.02;
 const SHIFT: f64 = 0.01;
-/// Photographs from which rings are searched at most: each ring has many.
+/// Maximum number of photographs from which rings are searched: each ring has many.
 const ANCHORS: usize = 64;
 
-/// About which the scene turns, in camera axes.
+/// The axis about which the scene turns, in camera axes.
 struct Axis {
     direction: DVec3,
     /// Its point nearest to the camera.
@@ -29,7 +31,8 @@ struct Axis {
 }
 
 impl Axis {
-    /// From the camera at `b` to that at `a`, if the scene turns about an axis between them and does not shift along it.
+    /// The axis about which the scene turns between the cameras at `b` and `a`, in the axes of `a`, if it turns enough and does not shift
+    /// along the axis.
     fn between(a: &DPose, b: &DPose) -> Option<Self> {
         let turn = (a.rotation.inverse() * b.rotation).normalize();
         let turn = if turn.w < 0.0 { -turn } else { turn };
@@ -47,7 +50,7 @@ impl Axis {
     }
 }
 
-/// The photographs of each ring, the largest first, if the model is that of a turntable; else none.
+/// The photographs of each ring, largest first, if the model is that of a turntable; otherwise empty.
 pub fn turntable(model: &Model) -> Vec<Vec<usize>> {
     let posed = model.poses.iter().enumerate().filter(|(_, pose)| pose.is_some());
     let mut left: Vec<usize> = posed.map(|(photo, _)| photo).collect();
@@ -80,12 +83,12 @@ fn largest_ring(model: &Model, of: &[usize]) -> Option<Vec<usize>> {
         .step_by(of.len().div_ceil(ANCHORS).max(1))
         .map(|anchor| around(*anchor))
         .collect();
-    // The first of several.
+    // The first of several rings of equal size.
     let ring = rings.into_iter().rev().max_by_key(Vec::len)?;
     (ring.len() >= LEAST).then_some(ring)
 }
 
-/// The photographs of those `axes` that are near one of them.
+/// The photographs of those `axes` that are near `axis`.
 fn near<'a>(axis: &'a Axis, axes: &'a [(usize, Axis)]) -> impl Iterator<Item = usize> + 'a {
     axes.iter().filter(|of| axis.is_near(&of.1)).map(|of| of.0)
 }
@@ -140,7 +143,7 @@ mod tests {
         let mut found = turntable(&rings(0.0));
         found.iter_mut().for_each(|ring| ring.sort_unstable());
         found.sort_unstable();
-        // The photograph opposite turns by more than determines an axis.
+        // The photograph on the opposite side is turned too far to determine an axis.
         assert_eq!(found.len(), 2, "{found:?}");
         for (ring, first) in found.iter().zip([0, 12]) {
             assert!(ring.len() >= 11, "{ring:?}");

@@ -8,10 +8,11 @@ use crate::{Features, PairMatches};
 use glam::{DQuat, DVec3};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Photographs up to which each is missed, pairs that contradict a model are few, and a mapping takes a fraction of a second.
+/// Captures of up to this many photographs count as small: each photograph matters, few pairs contradict a wrong model, and a mapping
+/// takes a fraction of a second.
 pub const FEW_PHOTOS: usize = 25;
 
-/// What is known of a photograph beside its features.
+/// What is known about a photograph besides its features.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PhotoInfo {
     /// Name, for messages.
@@ -22,17 +23,18 @@ pub struct PhotoInfo {
     pub height: u32,
     /// Photographs of the same group have the same camera; groups are numbered from 0.
     pub group: usize,
-    /// Focal length in px if the photograph's metadata tell it.
+    /// Focal length in px, if the photograph's metadata contain it.
     pub focal_prior_px: Option<f64>,
-    /// The direction up in camera axes (x right, y down, z forward) if known; otherwise -y, as most photographs are held, unless all look down.
+    /// The up direction in camera axes (x right, y down, z forward) if known; otherwise -y, as most photographs are taken, unless all look
+    /// down.
     pub up: Option<DVec3>,
-    /// The camera of its group, if it is known exactly; it is held.
+    /// The camera of its group, if it is known exactly; it is then held fixed.
     pub camera: Option<DCamera>,
-    /// Its place on a rig, if it is on one.
+    /// Its mount on a rig, if it is on one.
     pub mount: Option<Mount>,
 }
 
-/// The place of a photograph on a rig: all photographs of a rig are taken from one position.
+/// How a photograph is mounted on a rig: all photographs of a rig are taken from one position.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Mount {
     /// The rig's number.
@@ -56,7 +58,7 @@ pub(crate) fn rigs(photos: &[PhotoInfo]) -> Vec<Vec<usize>> {
     photos.iter().enumerate().map(of).collect()
 }
 
-/// What is known before mapping, and stays as it is.
+/// Poses and cameras that are known before mapping and stay as they are.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Known {
     /// `[photos]` poses.
@@ -74,34 +76,35 @@ impl From<&Model> for Known {
     }
 }
 
-/// How to verify and map. The defaults are COLMAP's where it has the same parameter.
+/// Options of verification and mapping. The defaults are COLMAP's where it has the same parameter.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MapOptions {
-    /// Largest distance from the epipolar line of an inlier, px.
+    /// Maximum distance of an inlier from its epipolar line, px.
     pub max_epipolar_error: f64,
-    /// Inliers below which a pair is dropped.
+    /// Minimum number of inliers of a pair that is kept.
     pub min_inliers: usize,
-    /// Whether a pair that passes is matched once more along its epipolar lines, where features need not differ from those elsewhere.
+    /// Whether a verified pair is matched once more along its epipolar lines, where features need not be distinct from those elsewhere.
     pub guided: bool,
-    /// Whether what may be a narrow view is mapped once more as one, where the model is in doubt and no metadata tell a focal length.
+    /// Whether the photographs are mapped once more with a narrow field of view if the model is in doubt and there are no metadata with a
+    /// focal length.
     pub narrow: bool,
-    /// Largest reprojection error of an observation, px.
+    /// Maximum reprojection error of an observation, px.
     pub max_error: f64,
-    /// Largest reprojection error of an inlier when a photograph is registered, px.
+    /// Maximum reprojection error of an inlier when a photograph is registered, px.
     pub max_registration_error: f64,
-    /// Inliers below which a photograph is not registered.
+    /// Minimum number of inliers to register a photograph.
     pub min_registration_inliers: usize,
-    /// Smallest angle between two rays of a point, radians.
+    /// Minimum angle between two rays of a point, radians.
     pub min_angle: f64,
-    /// Photographs and points grow by this factor between two global adjustments.
+    /// Growth factor of the number of photographs or points after which everything is adjusted again.
     pub global_growth: f64,
-    /// Photographs of a local adjustment.
+    /// Maximum number of photographs in a local adjustment.
     pub local_photos: usize,
-    /// Photographs below which a model is dropped.
+    /// Minimum number of photographs of a model that is kept.
     pub min_model_photos: usize,
-    /// Models at most.
+    /// Maximum number of models.
     pub max_models: usize,
-    /// Photographs of one camera from which fx and fy, k2 and the tangential coefficients are adjusted, not only f and k1.
+    /// Minimum number of photographs of a camera to adjust fx and fy, k2 and the tangential coefficients, not only f and k1.
     pub full_lens_photos: usize,
 }
 
@@ -130,16 +133,16 @@ impl Default for MapOptions {
 pub enum Progress {
     /// Pairs have been verified.
     Verified {
-        /// Pairs with a common geometry.
+        /// Number of pairs with a common geometry.
         pairs: usize,
-        /// Pairs with matches.
+        /// Number of pairs with matches.
         of: usize,
     },
     /// A photograph has been registered.
     Registered {
         /// Photographs in this model.
         photos: usize,
-        /// Photographs in all.
+        /// Total number of photographs.
         of: usize,
         /// Points in this model.
         points: usize,
@@ -162,7 +165,7 @@ pub enum PairKind {
     General,
     /// A plane, seen from two places.
     Planar,
-    /// One place, two directions: extends tracks, never seeds.
+    /// One place, two directions: it extends tracks but is never a seed.
     Rotation,
 }
 
@@ -175,13 +178,13 @@ pub struct VerifiedPair {
     pub matches: Vec<[u32; 2]>,
     /// How they are related.
     pub kind: PairKind,
-    /// The motion between them, of unknown length, with the focal lengths that were known or guessed.
+    /// The motion between them, with a translation of unknown length, for the known or guessed focal lengths.
     pub motion: Motion,
-    /// The median angle between both rays of a match, radians.
+    /// The median angle between the two rays of a match, radians.
     pub angle: f64,
 }
 
-/// Models, and what became of the rest.
+/// The result of mapping: models, and the photographs that are in none.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Reconstruction {
     /// Largest first.
@@ -192,24 +195,24 @@ pub struct Reconstruction {
     pub pairs: Vec<VerifiedPair>,
     /// `[groups]` the camera of each group before the last mapping, and where its focal length comes from.
     pub cameras: Vec<(DCamera, Source)>,
-    /// Photographs of one group that turned out to have two focal lengths: each `Zoom` makes a further group.
+    /// Photographs of one group that turned out to have another focal length: each `Zoom` adds a group.
     pub zooms: Vec<Zoom>,
-    /// Whether each photograph became a group of its own, because each has a focal length of its own that no metadata tell.
+    /// Whether each photograph became its own group, because each has its own focal length and the metadata do not contain it.
     pub own_focals: bool,
-    /// Pairs that share next to nothing, though by their poses in the largest model they see the same, or in the one that was taken apart, those with most
-    /// expected points first.
+    /// Pairs that share next to nothing, although their poses in the largest model, or in the model that was split, say that they see the
+    /// same part of the scene; most expected points first.
     pub absent: Vec<Absent>,
-    /// Models of parts that were taken for one another at first, if there are such.
+    /// Number of models of parts that were first mistaken for one another, if the model was split into them.
     pub apart: Option<usize>,
 }
 
 impl Reconstruction {
-    /// Photographs with a pose in the largest model.
+    /// Number of photographs with a pose in the largest model.
     pub fn registered(&self) -> usize {
         self.models.first().map_or(0, Model::registered)
     }
 
-    /// Neighbours whose matches contradict the largest model; 0 for more than [`FEW_PHOTOS`], of which some always do.
+    /// Number of neighbours whose matches contradict the largest model; 0 for more than [`FEW_PHOTOS`] photographs, where some always do.
     pub fn contradictions(&self, photos: &[PhotoInfo], features: &[Features]) -> usize {
         let few = photos.len() <= FEW_PHOTOS;
         let Some(model) = self.models.first().filter(|_| few) else {
@@ -219,7 +222,8 @@ impl Reconstruction {
         contradictions(&self.pairs, &strengths(photos, features, &self.pairs), &agreement).len()
     }
 
-    /// Pairs of photographs that should share points and do not, where they are too many to be chance, and that are not among `matched`.
+    /// Pairs of photographs that should share points and do not, without those in `matched`; empty if there are too few to rule out
+    /// coincidence.
     pub fn absent_and_unmatched(&self, matched: &[PairMatches]) -> Vec<[u32; 2]> {
         if self.absent.len() < ABSENT_PAIRS {
             return Vec::new();
@@ -229,7 +233,7 @@ impl Reconstruction {
         pairs.filter(|pair| !matched.contains(pair)).collect()
     }
 
-    /// Puts photographs that were zoomed into the groups by which `cameras` and those of the models are numbered.
+    /// Sets the groups of `photos` to those by which `cameras` and the cameras of the models are indexed.
     pub fn regroup(&self, photos: &mut [PhotoInfo]) {
         if self.own_focals {
             let groups = photos.iter_mut().enumerate();
@@ -241,21 +245,21 @@ impl Reconstruction {
     }
 }
 
-/// Photographs that share next to nothing, though by their poses in a model they see the same.
+/// Two photographs that share next to nothing, although their poses in a model say that they see the same part of the scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Absent {
     /// Their indices, ascending.
     pub photos: [u32; 2],
-    /// Points of the model that should be matched.
+    /// Number of points of the model that should be matched.
     pub expected: usize,
 }
 
-/// Photographs that have another focal length than the rest of their group, which no metadata tell.
+/// Photographs whose focal length differs from that of the rest of their group, unknown to the metadata.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Zoom {
-    /// Their group before.
+    /// Their previous group.
     pub of: usize,
-    /// Their group now.
+    /// Their new group.
     pub group: usize,
     /// Their indices, ascending.
     pub photos: Vec<usize>,
@@ -263,8 +267,8 @@ pub struct Zoom {
     pub focals: [f64; 2],
 }
 
-/// Cameras, poses and points in one world: that of what was known; else up is +Z, the origin is near the scene's middle, the cameras'
-/// distance is about 1.
+/// Cameras, poses and points in one world: that of the known poses, if there were any; otherwise +Z is up, the origin is near the centre
+/// of the scene, and the cameras' distance from it is about 1.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Model {
     /// `[groups]` the camera of each group; `None` if none of its photographs is registered.
@@ -273,7 +277,7 @@ pub struct Model {
     pub poses: Vec<Option<DPose>>,
     /// Points.
     pub points: Vec<ModelPoint>,
-    /// `[groups]` whether the focal length was held, because nothing in the photographs determines it.
+    /// `[groups]` whether the focal length was held fixed because nothing in the photographs determines it.
     pub focal_held: Vec<bool>,
 }
 
@@ -283,7 +287,7 @@ impl Model {
         self.poses.iter().flatten().count()
     }
 
-    /// Number of observations that points explain.
+    /// Number of observations of all points.
     pub fn observations(&self) -> usize {
         self.points.iter().map(|point| point.track.len()).sum()
     }
@@ -297,7 +301,7 @@ impl Model {
 /// A point and where it is seen.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ModelPoint {
-    /// World.
+    /// Position, world.
     pub position: DVec3,
     /// Photograph and keypoint, sorted by photograph.
     pub track: Vec<(u32, u32)>,
@@ -319,20 +323,20 @@ pub struct LeftOut {
 pub enum Reason {
     /// Fewer features than a pair needs.
     FewFeatures {
-        /// How many.
+        /// Its number of features.
         features: usize,
     },
     /// Too few matches with any other photograph.
     FewMatches {
-        /// Matches with the best partner.
+        /// Number of matches with the best partner.
         best: usize,
     },
     /// Matches that no common geometry explains.
     NoGeometry {
-        /// Matches with the best partner.
+        /// Number of matches with the best partner.
         best: usize,
     },
-    /// Seen from the same place as all its partners.
+    /// Taken from the same place as all its partners.
     RotationOnly {
         /// Number of partners.
         partners: usize,
@@ -342,7 +346,7 @@ pub enum Reason {
         /// Number of partners.
         partners: usize,
     },
-    /// Partners are in a model, but too few points of it are seen at consistent places.
+    /// Partners are in a model, but too few of its points are seen at consistent positions.
     NotRegistered {
         /// Number of partners.
         partners: usize,
@@ -358,7 +362,7 @@ impl std::fmt::Display for Reason {
             Reason::FewMatches { best } => {
                 write!(
                     f,
-                    "at most {best} features match another photograph: nothing overlaps with it enough"
+                    "at most {best} features match another photograph: none overlaps with it enough"
                 )
             }
             Reason::NoGeometry { best } => {

@@ -1,23 +1,25 @@
-//! Parts of a scene that look alike may be taken for one another, and fold the model.
+//! Repair of folded models, in which parts of the scene that look alike were mistaken for one another.
 //!
-//! What looks alike shares less of the pictures than what is the same: a label that occurs twice has many matches, but not the
-//! background around it. So the strongest pairs, those whose matches cover most, must agree with the model. Where some do not, the
-//! scene is mapped again from pairs close to one another in their spanning tree, then from all pairs that agree with the outcome.
+//! Photographs of parts that only look alike share a smaller area than photographs of the same part: a label that occurs twice has many
+//! matches, but the background around it has none. The strongest pairs, those whose matches cover most, must therefore agree with the
+//! model. Where some do not, the scene is mapped again from pairs that are close to one another in the spanning tree of the strongest
+//! pairs, then from all pairs that agree with the result.
 //!
-//! The tree of few photographs has few pairs across a fold, often a single one, and no pair of them is far: all neighbours tell there,
-//! and closer and closer pairs are tried.
+//! For few photographs, the tree has few pairs across a fold, often a single one, and all pairs are close. All neighbours then count as
+//! evidence, and closer and closer pairs are tried.
 
 use super::agree::{CONTRADICTS, agreement, contradictions, near_in_tree, spanning_tree, strengths};
 use super::types::{FEW_PHOTOS, Model, Progress, VerifiedPair};
 use super::{Grown, Input, grown};
 
-/// What differs between few photographs and many.
+/// Parameters that differ between few photographs and many.
 struct Rules {
-    /// Pairs that contradict a model from which on it is folded.
+    /// Minimum number of pairs that contradict a model for it to count as folded.
     folded: usize,
-    /// Fraction of the photographs of the first model that another must hold. Few photographs without a pose get a second attempt.
+    /// Minimum number of photographs in another model, relative to the first. If only a few photographs lack a pose, they get a second
+    /// attempt.
     keeps: f64,
-    /// Steps along the tree within which pairs are used first: one mapping for each.
+    /// Maximum number of steps along the tree between the photographs of a pair that is used first: one mapping for each.
     hops: &'static [usize],
 }
 
@@ -31,15 +33,15 @@ const OF_MANY: Rules = Rules {
     keeps: 0.9,
     hops: &[4],
 };
-/// Fraction of the matches of a pair that agree with the model of the tree, from which on it is used.
+/// Minimum fraction of the matches of a pair that agree with the model of the tree for the pair to be used.
 const AGREES: f64 = 0.8;
 
-/// Models, and how the pairs fit the largest.
+/// Models, and how well the pairs fit the largest.
 struct Judged {
     grown: Grown,
     /// `[pairs]` the fraction of the matches that agree.
     agreement: Vec<Option<f64>>,
-    /// Pairs that tell and contradict it.
+    /// Number of pairs that count as evidence and contradict it.
     folds: usize,
 }
 
@@ -48,7 +50,7 @@ impl Judged {
         self.grown.models.first().map_or(0, Model::registered)
     }
 
-    /// Strength of the pairs that agree with it.
+    /// Total strength of the pairs, weighted by the fractions of their matches that agree with it.
     fn support(&self, strengths: &[f64]) -> f64 {
         let agreeing = self.agreement.iter().zip(strengths);
         agreeing
@@ -57,7 +59,8 @@ impl Judged {
     }
 }
 
-/// Of the models that pairs contradict at most half as often the one with which the strongest agree, where `found` is folded and there are such; else `found`.
+/// If `found` is folded, the models with the most support among those that at most half as many pairs contradict; `found` if it is not
+/// folded or there are none.
 pub(super) fn unfolded(input: &Input, found: Grown, progress: &mut dyn FnMut(Progress)) -> Grown {
     let Input {
         photos,

@@ -1,4 +1,4 @@
-//! Which matches of a pair agree with one geometry, and what kind of geometry that is.
+//! Verification: which matches of a pair agree with one geometry, and the kind of this geometry.
 
 use super::focal::{self, Source};
 use super::types::{MapOptions, PairKind, PhotoInfo, Progress, VerifiedPair};
@@ -13,20 +13,20 @@ use crate::{Features, PairMatches, median};
 use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 
-/// Samples at most. With 40 % inliers, five points are all inliers once in 100 samples.
+/// Maximum number of samples. With 40 % inliers, one of 100 samples of five points has inliers only.
 const SAMPLES: usize = 600;
 const CONFIDENCE: f64 = 0.9999;
-/// Inliers of a homography, or of a rotation, by those of the essential matrix, from which on it explains the pair.
+/// A homography or a rotation explains a pair if it has at least this fraction of the essential matrix's inliers.
 const EXPLAINS: f64 = 0.8;
 
-/// Largest distance from a pair's epipolar line of a match that is found along it, by that of its inliers. Whatever is near a line may match; with the whole
-/// distance, models of weak pairs lose a third of their photographs.
+/// Maximum distance of guided matches from their epipolar line, relative to that of inliers. Anything near a line may match: with the
+/// full distance, models of weak pairs lose a third of their photographs.
 const OFF_LINE: f64 = 0.5;
 
-/// The median angle below which a pair is a rotation, radians: about three pixels at a long side of a thousand.
+/// A pair whose median angle is below this is a rotation, radians: about three pixels for a long side of a thousand.
 const LEAST_ANGLE: f64 = 0.003;
 
-/// The camera of each group before any adjustment, and where its focal length comes from; the principal point is in the centre.
+/// `[groups]` the camera of each group before any adjustment, and where its focal length comes from; the principal point is at the centre.
 pub type Cameras = Vec<(DCamera, Source)>;
 
 /// A pair's fundamental matrix between pixels that are centred and divided by each photograph's long side.
@@ -35,12 +35,12 @@ pub(super) struct Uncalibrated {
     /// Index into the pairs.
     pub pair: usize,
     pub matrix: DMat3,
-    /// Inliers.
+    /// `[M]` whether each match is an inlier.
     pub inliers: Vec<bool>,
     pub count: usize,
 }
 
-/// Cameras with known or guessed focal lengths, and the pairs that agree with them.
+/// Cameras with known or guessed focal lengths, and the pairs that agree with a geometry under them.
 pub fn verify(
     photos: &[PhotoInfo],
     features: &[Features],
@@ -51,7 +51,7 @@ pub fn verify(
     verify_with(photos, features, pairs, &[], options, progress)
 }
 
-/// As [`verify`], with the cameras of some groups.
+/// Like [`verify`], with the cameras of some groups given.
 pub(super) fn verify_with(
     photos: &[PhotoInfo],
     features: &[Features],
@@ -60,7 +60,7 @@ pub(super) fn verify_with(
     options: &MapOptions,
     progress: &mut dyn FnMut(Progress),
 ) -> (Cameras, Vec<VerifiedPair>) {
-    // With metadata for all, a few pairs suffice to check them.
+    // If all photographs have metadata, a few pairs suffice to check them.
     let known = photos.iter().all(|p| p.focal_prior_px.is_some());
     let mut voters: Vec<usize> = (0..pairs.len()).collect();
     voters.sort_by_key(|i| (std::cmp::Reverse(pairs[*i].matches.len()), *i));
@@ -85,7 +85,7 @@ pub(super) fn verify_with(
         .par_iter()
         .zip(&uncalibrated)
         .filter_map(|(pair, uncalibrated)| {
-            // Without a common epipolar geometry there is no common calibrated one.
+            // Without a common epipolar geometry there is no calibrated one either.
             if pair.matches.len() < options.min_inliers || (!known && uncalibrated.is_none()) {
                 return None;
             }
@@ -142,7 +142,7 @@ fn fundamental(
     };
     let enough = |best: &Estimate<DMat3>| best.inliers >= options.min_inliers;
     let best = estimate(&problem, Vec::new(), limits).filter(enough).or_else(|| {
-        // Seven points of one photograph taken twice, or of a noiseless turn, leave the matrix open: any epipole does.
+        // If one photograph was taken twice, or for a noiseless turn, seven points do not determine the matrix: any epipole fits.
         let plane = estimate(
             &Homography {
                 points: &points,
@@ -172,7 +172,7 @@ fn fundamental(
     })
 }
 
-/// `k_b^T f k_a` for a fundamental matrix between centred pixels by the long side, with focal lengths in long sides.
+/// `k_b^T f k_a` for a fundamental matrix between centred pixels relative to the long side, with focal lengths relative to the long side.
 pub(super) fn essential_from(fundamental: DMat3, focal_a: f64, focal_b: f64) -> DMat3 {
     let scale = |f: f64| DMat3::from_diagonal(DVec3::new(f, f, 1.0));
     closest_essential(scale(focal_b) * fundamental * scale(focal_a))
@@ -190,7 +190,7 @@ fn calibrated(
     let [camera_a, camera_b]: [&DCamera; 2] = group.map(|g| &g.0);
     let plane = |camera: &DCamera, at: DVec2| {
         if camera.fisheye {
-            // What is not a number is no inlier.
+            // NaN is never an inlier.
             return camera.unproject(at).unwrap_or(DVec2::NAN);
         }
         let [fx, fy, cx, cy, ..] = camera.parameters;
@@ -230,7 +230,7 @@ fn calibrated(
         group.iter().any(|g| g.1 != Source::Prior) && uncalibrated.count as f64 > 1.2 * count as f64
     });
     if let Some(uncalibrated) = better {
-        // The guessed focal length is off: the matches are those of the fundamental matrix.
+        // The guessed focal length is off: the inliers of the fundamental matrix are used.
         inliers.clone_from(&uncalibrated.inliers);
         count = uncalibrated.count;
     }
@@ -281,7 +281,7 @@ fn calibrated(
     })
 }
 
-/// From homogeneous pixels to the plane z = 1, without distortion.
+/// Maps homogeneous pixels to the plane z = 1, ignoring distortion.
 pub(super) fn to_plane(camera: &DCamera) -> DMat3 {
     let [fx, fy, cx, cy, ..] = camera.parameters;
     DMat3::from_cols(
@@ -291,7 +291,7 @@ pub(super) fn to_plane(camera: &DCamera) -> DMat3 {
     )
 }
 
-/// From homogeneous pixels to those of [`centered_points`].
+/// Maps homogeneous pixels to the coordinates of [`centered_points`].
 fn to_centered(photo: &PhotoInfo) -> DMat3 {
     let scale = 1.0 / long_side(photo);
     let center = 0.5 * scale * DVec2::new(f64::from(photo.width), f64::from(photo.height));
@@ -329,7 +329,7 @@ fn kind(points: &[[DVec2; 2]], threshold: f64, pair: &PairMatches) -> PairKind {
     if (plane.inliers as f64) < explained {
         return PairKind::General;
     }
-    // Twice: the second time without what does not turn along. The lens may be unknown yet: twice the threshold.
+    // The second fit leaves out what does not follow the turn. The threshold is doubled because the lens may still be unknown.
     let turned = turned(points, &[2.0 * threshold], 2.0 * threshold);
     if turned as f64 >= explained {
         PairKind::Rotation
@@ -338,7 +338,7 @@ fn kind(points: &[[DVec2; 2]], threshold: f64, pair: &PairMatches) -> PairKind {
     }
 }
 
-/// The median angle between both rays of the points in front of both cameras.
+/// The median angle between the two rays of the points in front of both cameras.
 fn median_angle(motion: &Motion, points: &[[DVec2; 2]]) -> f64 {
     let angles = points
         .iter()

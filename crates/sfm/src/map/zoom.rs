@@ -1,15 +1,14 @@
-//! Photographs of one camera that were zoomed, or cropped and enlarged, without metadata that tell.
+//! Detection of photographs of one camera that were zoomed, or cropped and enlarged, without metadata that say so.
 //!
-//! A model under one focal length seems sound: cameras step nearer instead. But when each photograph is given its own focal length,
-//! those of a zoomed capture part into two clusters, and the errors fall. The clusters then are cameras of their own, and the scene is
-//! mapped again. Measured on seven captures as they are, and on four of them and a ray-traced ring with half of each enlarged 1.6 times: as
-//! they are, the cost falls by 0 to 7 % and no clusters are more than 1.1 apart; enlarged, it falls by 5 to 58 %, and the clusters are 1.23
-//! to 1.58 apart before the scene is mapped again.
+//! A model with a single focal length looks sound: cameras move closer instead. But when each photograph is given its own focal length,
+//! those of a zoomed capture form two clusters, and the errors fall. The clusters then become separate cameras, and the scene is mapped
+//! again. This was measured on seven unmodified captures, and on four of them and a ray-traced ring with half of the photographs enlarged
+//! 1.6 times: unmodified, the cost falls by 0 to 7 % and no clusters differ by a ratio of more than 1.1; enlarged, it falls by 5 to 58 %,
+//! and the clusters differ by 1.23 to 1.58 before the scene is mapped again.
 //!
-//! Where focal lengths differ from photograph to photograph instead, as in pictures of many cameras scaled to one size, each photograph
-//! becomes a camera of its own. With each of four captures cut to 65 to 100 % of its width and scaled back, the cost falls by 35 to 70 % and
-//! the focal lengths are 8 to 14 % from their median; in twenty captures as they are,
-//! by at most 8 % and 2.3 %.
+//! If focal lengths differ from photograph to photograph instead, as in photographs from many cameras scaled to one size, each photograph
+//! becomes its own camera. For four captures whose photographs were cropped to 65 to 100 % of their width and scaled back, the cost falls
+//! by 35 to 70 % and the focal lengths are 8 to 14 % from their median; for twenty unmodified captures, at most 8 % and 2.3 %.
 
 use super::focal::are_alike;
 use super::observable::determines_focal;
@@ -19,41 +18,42 @@ use crate::adjust::{AdjustedCamera, Belief, Focal, Freedom};
 use crate::geometry::camera::DCamera;
 use crate::{Features, median};
 
-/// Photographs of a cluster, at least: fewer hardly determine a camera.
+/// Minimum number of photographs in a cluster: fewer hardly determine a camera.
 const LEAST: usize = 3;
-/// Ratio of the focal lengths of two models, at most: of a model that follows what moves before the scene, it may be anything.
+/// Maximum ratio of the focal lengths of two models: that of a model that follows something moving in front of the scene is arbitrary.
 const FARTHEST: f64 = 2.5;
-/// Photographs of a model from which on its focal length is one to compare with another model's.
+/// Minimum number of photographs of a model whose focal length is compared with another model's.
 const ALONE: usize = 8;
-/// The same, by those of the largest model: for fewer the scene is not mapped again.
+/// The same, relative to the number in the largest model: for fewer the scene is not mapped again.
 const PART: f64 = 0.1;
-/// Ratio of the focal lengths of two clusters, at least.
+/// Minimum ratio of the focal lengths of two clusters.
 const APART: f64 = 1.2;
-/// Distance between the two clusters, by that of their medians, at least. Along a drone's film of 90 frames without a zoom, focal lengths drift from 590 to 946 px, and the cost
-/// falls by 40 %: parted at the 63rd frame, its camera jumps there by 32 times the usual step.
+/// Minimum gap between the two clusters, relative to the distance of their medians. Along a drone's film of 90 frames without a zoom,
+/// focal lengths drift from 590 to 946 px, and the cost falls by 40 %: split at the 63rd frame, its camera jumps there by 32 times the
+/// usual step.
 const GAP: f64 = 0.25;
-/// Mean distance of the photographs from the median of their cluster, by that of the two medians, at most.
+/// Maximum mean distance of the photographs from the median of their cluster, relative to the distance of the two medians.
 const SCATTER: f64 = 0.15;
-/// Fraction by which the cost falls with a focal length a photograph, at least.
+/// Minimum fraction by which the cost falls with a focal length for each photograph.
 const BETTER: f64 = 0.02;
-/// Fraction by which the cost falls, and median distance of the focal lengths from their median, logarithmic, from which on each
-/// photograph may have a focal length of its own.
+/// Minimum fraction by which the cost falls, and minimum median logarithmic distance of the focal lengths from their median, for each
+/// photograph to get its own focal length.
 const MUCH: f64 = 0.25;
 const VARIES: f64 = 0.05;
-/// Squared error, px^2, that a change of a focal length by half is worth.
+/// Cost of a change of a focal length by half, as a squared error, px^2.
 const BELIEF: f64 = 10.0;
 
-/// What the own focal lengths of a model's photographs tell of its cameras.
+/// How the focal lengths of a model's photographs are distributed.
 pub(super) enum Focals {
     /// Photographs of one camera have one focal length.
     Shared,
-    /// Those of one camera part into two: the fewer of them become a new group.
+    /// The photographs of one camera form two clusters: the smaller one becomes a new group.
     Parted(Zoom),
     /// They differ from photograph to photograph.
     Own,
 }
 
-/// What a model's photographs tell, if each is given its own focal length.
+/// The distribution of the focal lengths of a model's photographs when each is given its own.
 pub(super) fn find(photos: &[PhotoInfo], features: &[Features], model: &Model) -> Focals {
     let groups = model.cameras.len();
     let of_group =
@@ -74,7 +74,7 @@ pub(super) fn find(photos: &[PhotoInfo], features: &[Features], model: &Model) -
         let of = sorted(group);
         let (cut, medians) = clusters(&of)?;
         let (short, long) = of.split_at(cut);
-        // The camera of most stays.
+        // The larger cluster keeps the camera.
         let fewer = usize::from(long.len() <= short.len());
         let mut zoomed: Vec<usize> = [short, long][fewer].iter().map(|p| p.1).collect();
         zoomed.sort_unstable();
@@ -90,7 +90,7 @@ pub(super) fn find(photos: &[PhotoInfo], features: &[Features], model: &Model) -
         let middle = of.get(of.len() / 2).map_or(0.0, |v| v.0);
         of.len() >= 2 * LEAST && median(of.iter().map(|v| (v.0 - middle).abs()).collect()).is_some_and(|m| m > VARIES)
     };
-    // What is known of a lens, by metadata or a rig, is not given up.
+    // A lens that is known from metadata or from a rig is not given up.
     let untold = |photo: &PhotoInfo| photo.focal_prior_px.is_none() && photo.camera.is_none() && photo.mount.is_none();
     match parted {
         Some(zoom) => Focals::Parted(zoom),
@@ -99,8 +99,8 @@ pub(super) fn find(photos: &[PhotoInfo], features: &[Features], model: &Model) -
     }
 }
 
-/// Photographs of one camera that are in a model of their own, with another focal length: zoomed so far that too few pairs with the others
-/// agree with one focal length. `None` if there are no such.
+/// Photographs of one camera that are in a separate model with another focal length: they were zoomed so far that too few pairs with the
+/// others agree with one focal length. `None` if there are none.
 pub(super) fn between(photos: &[PhotoInfo], models: &[Model]) -> Option<Zoom> {
     let (first, others) = models.split_first()?;
     let groups = first.cameras.len();
@@ -122,7 +122,8 @@ pub(super) fn between(photos: &[PhotoInfo], models: &[Model]) -> Option<Zoom> {
     })
 }
 
-/// Whether a second model, which shares nothing with the first, found the same focal length, and the first determines it: so it does not come from where both began.
+/// Whether a second model, which shares nothing with the first, found the same focal length, and the first determines it, so that it is
+/// not merely the initial value of both.
 pub(super) fn is_confirmed(photos: &[PhotoInfo], features: &[Features], models: &[Model]) -> bool {
     let Some((first, others)) = models.split_first() else {
         return false;
@@ -143,7 +144,7 @@ fn free_focal(model: &Model, group: usize) -> Option<f64> {
     camera.map(DCamera::focal)
 }
 
-/// Whether both cameras of what was mapped with `zoom` still are as far apart.
+/// Whether the focal lengths of both cameras of `zoom` still differ enough in `models`, which were mapped with it.
 pub(super) fn holds(zoom: &Zoom, models: &[Model]) -> bool {
     let focals = [zoom.of, zoom.group].map(|group| camera(models, group).map(DCamera::focal));
     match focals {
@@ -157,7 +158,7 @@ pub(super) fn camera(models: &[Model], group: usize) -> Option<&DCamera> {
     models.iter().find_map(|model| model.cameras[group].as_ref())
 }
 
-/// Where sorted values part into two clusters, and the medians of both; `None` if they do not.
+/// The index at which sorted values split into two clusters, and the medians of both; `None` if they do not.
 fn clusters(sorted: &[(f64, usize)]) -> Option<(usize, [f64; 2])> {
     let middle = |part: &[(f64, usize)]| median(part.iter().map(|v| v.0).collect());
     let mut best: Option<(f64, usize, [f64; 2])> = None;
@@ -226,7 +227,7 @@ mod tests {
             of(&[500.0, 800.0, 505.0, 790.0, 495.0, 810.0, 500.0]),
             Some((4, [500.0, 800.0]))
         );
-        // One setting that is poorly known, too few of another, and a zoom that never rests.
+        // A single setting that is poorly determined, too few photographs of another one, and a zoom that never rests.
         assert_eq!(of(&[500.0, 510.0, 470.0, 540.0, 530.0, 505.0]), None);
         assert_eq!(of(&[500.0, 501.0, 502.0, 499.0, 800.0, 500.0]), None);
         assert_eq!(of(&[500.0, 540.0, 580.0, 620.0, 660.0, 700.0, 740.0, 780.0]), None);

@@ -13,9 +13,9 @@ pub enum TwoView {
     Homography(DMat3),
 }
 
-/// As [`super::match_features`], but only among features that agree with `geometry`: a Sampson distance (Hartley and Zisserman,
-/// eq. 11.9), or for homographies a distance in the second photograph, of at most `threshold` pixels. Both the nearest and the second
-/// nearest are sought there, so that repeated structures elsewhere do not make a match ambiguous.
+/// Like [`super::match_features`], but only among features that agree with `geometry`: their Sampson distance (Hartley and Zisserman,
+/// eq. 11.9), or for homographies the distance in the second photograph, is at most `threshold` pixels. Both the nearest and the second
+/// nearest neighbour are among these, so repeated structures elsewhere do not make a match ambiguous.
 pub fn match_guided(
     a: &Features,
     b: &Features,
@@ -58,7 +58,7 @@ struct Search {
     threshold2: f32,
     x: Vec<f32>,
     y: Vec<f32>,
-    /// The squared length of the gradient of `x2^T F x1` by `x1`; 0 for homographies.
+    /// The squared length of the gradient of `x2^T F x1` with respect to `x1`; 0 for homographies.
     gradient2: Vec<f32>,
     count: usize,
 }
@@ -71,7 +71,7 @@ impl Search {
             column.resize(count.next_multiple_of(16), 0.0);
             column
         };
-        // The scale of F is free.
+        // F is defined up to scale.
         let geometry = match *geometry {
             TwoView::Fundamental(f) => {
                 let largest = f.to_cols_array().iter().fold(0.0f64, |a, b| a.max(b.abs()));
@@ -120,7 +120,7 @@ impl Kernel for Along<'_> {
             let (x, y) = (simd.load(&search.x[at..]), simd.load(&search.y[at..]));
             let agree = match search.geometry {
                 TwoView::Fundamental(f) => {
-                    // The epipolar line, of unit normal: its distances are then small numbers.
+                    // The epipolar line with a unit normal keeps distances small.
                     let line = f * x1;
                     let length2 = line.truncate().length_squared().max(f64::MIN_POSITIVE);
                     let unit = line / length2.sqrt();
@@ -149,7 +149,7 @@ mod tests {
     use super::*;
     use crate::Keypoint;
 
-    /// Features at `places`, all of the same two looks in turn: only geometry can tell them apart.
+    /// Features at `places` that alternate between two descriptors: only geometry can tell them apart.
     fn repeated(places: &[[f32; 2]]) -> Features {
         let looks =
             [0usize, 64].map(|from| std::array::from_fn(|i| if (from..from + 64).contains(&i) { 64 } else { 1 }));

@@ -1,6 +1,6 @@
-//! Which features of two photographs look alike.
+//! Matching: the features of two photographs that look alike.
 //!
-//! Descriptors are compared exhaustively by exact integer products, so that matches depend neither on the instruction set nor on
+//! Descriptors are compared exhaustively by exact integer products, so matches depend neither on the instruction set nor on
 //! the number of threads.
 
 mod guided;
@@ -23,11 +23,11 @@ const LENGTH2: u32 = 512 * 512;
 /// When two features match.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MatchOptions {
-    /// The largest distance of a match relative to the second nearest descriptor, in both directions (Lowe 2004, 7.1). Default 0.8.
+    /// Maximum distance of a match relative to that of the second nearest descriptor, in both directions (Lowe 2004, 7.1). Default 0.8.
     pub ratio: f32,
-    /// The largest distance of a match, of unit descriptors. Default 0.7, as COLMAP's.
+    /// Maximum distance of a match between unit descriptors. Default 0.7, as in COLMAP.
     pub distance: f32,
-    /// What [`Level::detect`] found; tests choose others.
+    /// The result of [`Level::detect`]; tests choose others.
     pub level: Level,
 }
 
@@ -51,13 +51,13 @@ impl MatchOptions {
     }
 }
 
-/// Squared distance of two descriptors with this inner product.
+/// Squared distance between two descriptors with this inner product.
 fn distance2(product: u32) -> u32 {
     2 * LENGTH2.saturating_sub(product)
 }
 
-/// Pairs of features, one of `a` and one of `b`, that are each other's nearest and pass the tests of `options`; sorted by the first. Where both have frontal
-/// descriptors, these match what the others leave.
+/// Pairs of features, one of `a` and one of `b`, that are each other's nearest and pass the tests of `options`; sorted by the first.
+/// Where both have frontal descriptors, these match the features that the usual ones leave unmatched.
 pub fn match_features(a: &Features, b: &Features, options: &MatchOptions) -> Vec<[u32; 2]> {
     let matches = comparable(a, b).map(|[a, b]| match_descriptors(a, b, options));
     matches.reduce(joined).unwrap_or_default()
@@ -71,7 +71,7 @@ fn comparable<'a>(a: &'a Features, b: &'a Features) -> impl Iterator<Item = [&'a
     [usual].into_iter().chain(both.then_some(frontal))
 }
 
-/// `first`, and those of `second` whose features it leaves; sorted by the first photograph's.
+/// `first`, and the pairs of `second` whose features `first` leaves unmatched; sorted by the first photograph's feature.
 fn joined(first: Vec<[u32; 2]>, second: Vec<[u32; 2]>) -> Vec<[u32; 2]> {
     let [of_a, of_b]: [HashSet<u32>; 2] = [0, 1].map(|side| first.iter().map(|pair| pair[side]).collect());
     let left = second
@@ -103,7 +103,7 @@ fn mutual(of_a: &[Nearest], of_b: &[Nearest], options: &MatchOptions) -> Vec<[u3
 /// The matches of each of `pairs`, in their order, in parallel; `done` is called after each, from any thread.
 ///
 /// # Panics
-/// When a pair names a photograph that `features` has not.
+/// When a pair names a photograph that is not in `features`.
 pub fn match_pairs(
     features: &[Features],
     pairs: &[[u32; 2]],
@@ -125,7 +125,7 @@ pub fn match_pairs(
 mod tests {
     use super::*;
 
-    /// A descriptor of the length of RootSIFT with most of its weight at `at`.
+    /// A descriptor as long as a RootSIFT one with most of its weight at `at`.
     fn descriptor(at: usize, rest: u8) -> [u8; DESCRIPTOR_BYTES] {
         let mut bytes = [rest; DESCRIPTOR_BYTES];
         for i in 0..4 {

@@ -8,12 +8,12 @@ use std::collections::BTreeSet;
 pub struct PairOptions {
     /// Up to this many photographs, all pairs. Default 60.
     pub all_up_to: usize,
-    /// The most promising partners of each photograph beyond that. Default 30.
+    /// Partners of each photograph where there are more photographs, the most promising ones. Default 30.
     pub partners: usize,
-    /// Features of each photograph, the largest, that are compared to find partners. Default 400.
+    /// Number of the largest features of each photograph that are compared to find partners. Default 400.
     pub compared: usize,
-    /// Photographs follow one another in time: each is paired with this many successors too, and with those at twice the
-    /// distance up to 64. Default 0.
+    /// Photographs follow one another in time: each is also paired with this many successors, and with those 1, 2, 4, .. 64
+    /// photographs later. Default 0, which pairs none of these.
     pub successors: usize,
 }
 
@@ -31,7 +31,7 @@ impl Default for PairOptions {
 /// Pairs of photographs worth matching, ascending.
 ///
 /// Beyond [`PairOptions::all_up_to`] photographs, the largest features of each pair are matched (Wu, "Towards Linear-time Incremental
-/// Structure from Motion", 2013: few large features tell whether photographs overlap), and each photograph is paired with those that
+/// Structure from Motion", 2013: a few large features show whether photographs overlap), and each photograph is paired with those that
 /// have the most matches.
 pub fn candidate_pairs(features: &[Features], options: &PairOptions, matching: &MatchOptions) -> Vec<[u32; 2]> {
     let n = features.len() as u32;

@@ -1,4 +1,4 @@
-//! Synthetic worlds of points with known cameras: keypoints and matches without pictures.
+//! Synthetic worlds of points with known cameras: keypoints and matches without images.
 // Each test program uses a part of it.
 #![allow(dead_code)]
 
@@ -36,7 +36,7 @@ pub fn look(eye: DVec3, target: DVec3) -> DPose {
     }
 }
 
-/// A turn of `photos` cameras around the origin.
+/// `photos` cameras on `turns` turns around the origin.
 pub fn around(photos: usize, turns: f64) -> Vec<DPose> {
     (0..photos)
         .map(|i| {
@@ -51,7 +51,7 @@ pub fn around(photos: usize, turns: f64) -> Vec<DPose> {
 }
 
 impl World {
-    /// Points in a cube of side 5, each seen by those of `poses` it faces, with noise of `noise` px and a fraction `wrong` of
+    /// Points in a cube of side 5, each seen by those of `poses` that it faces, with noise of `noise` px and a fraction `wrong` of
     /// wrong matches.
     pub fn new(poses: Vec<DPose>, points: usize, noise: f64, wrong: f64, seed: u64) -> Self {
         let mut rng = Rng::new(seed, 1);
@@ -64,7 +64,7 @@ impl World {
         Self::of_points(CAMERA, poses, &points, 0, noise, wrong, seed)
     }
 
-    /// From points with the direction in which each faces. The first `twins` look like the `twins` after them.
+    /// A world of points, each with the direction in which it faces. The first `twins` points look like the next `twins` ones.
     pub fn of_points(
         camera: DCamera,
         poses: Vec<DPose>,
@@ -158,7 +158,7 @@ impl World {
         world
     }
 
-    /// With the middle of the photographs from `first` on enlarged: what leaves them has no matches.
+    /// The world with the photographs from `first` on enlarged about their centre by `ratio`: keypoints that leave them have no matches.
     pub fn zoomed(mut self, first: usize, ratio: f32) -> Self {
         let center = [0.5 * CAMERA.width as f32, 0.5 * CAMERA.height as f32];
         for features in &mut self.features[first..] {
@@ -170,12 +170,12 @@ impl World {
         self.without_what_left()
     }
 
-    /// With each photograph cut around its middle to a size of its own, of `keep` times the first: each has a camera of its own.
+    /// The world with each photograph cropped around its centre to `keep` times its size: each has its own camera.
     pub fn cut(self, keep: impl Fn(usize) -> f64) -> Self {
         self.cut_beside(keep, |_| [0.5; 2])
     }
 
-    /// As [`Self::cut`], with the fractions `before` of what is cut away to the left and above.
+    /// Like [`Self::cut`], with the fractions `before` of the cropped width and height removed at the left and at the top.
     pub fn cut_beside(mut self, keep: impl Fn(usize) -> f64, before: impl Fn(usize) -> [f64; 2]) -> Self {
         for (i, (photo, features)) in self.photos.iter_mut().zip(&mut self.features).enumerate() {
             let side = |side: u32| (f64::from(side) * keep(i) / 2.0).round() as u32 * 2;
@@ -189,7 +189,7 @@ impl World {
         self.without_what_left()
     }
 
-    /// Without the matches of keypoints outside their photographs.
+    /// The world without the matches of keypoints outside their photographs.
     fn without_what_left(mut self) -> Self {
         for pair in &mut self.pairs {
             let seen = |side: usize, keypoint: u32| {
@@ -203,7 +203,7 @@ impl World {
         self
     }
 
-    /// Both worlds, without matches between them; the second is another camera.
+    /// Both worlds, without matches between them; the second has another camera.
     pub fn and(mut self, other: Self) -> Self {
         let shift = self.photos.len() as u32;
         self.photos

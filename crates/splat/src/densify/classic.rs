@@ -10,7 +10,7 @@ use rayon::prelude::*;
 /// Options; docs give the Inria code's names and defaults.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ClassicOptions {
-    /// Mean screen gradient (normalised device coordinates) from which a splat is densified; `densify_grad_threshold` 0.0002.
+    /// Minimum mean screen gradient (normalised device coordinates) for a splat to be densified; `densify_grad_threshold` 0.0002.
     pub gradient_threshold: f32,
     /// World size that separates small splats from large ones; `percent_dense` 0.01 times the scene's extent.
     pub small: f32,

@@ -1,5 +1,5 @@
 //! Densification by image error, to a planned number: splats that show errors in several views are split in two across their
-//! longest axis, splats that contribute hardly anywhere are removed.
+//! longest axis, splats that contribute almost nothing are removed.
 //!
 //! It combines what made the fastest trainers fast. Error decides, not the gradient alone, and it is accumulated over all
 //! views since the last round (FastGS, Ren et al. 2025; Rota Bulo et al. 2024); this is free here, since the backward pass
@@ -16,15 +16,15 @@ use rayon::prelude::*;
 pub struct FastOptions {
     /// Maximum number of splats after the round.
     pub target: usize,
-    /// Number of splats below which none that is finite is removed: where photographs disagree, all splats fade.
+    /// Minimum number of finite splats that a round leaves: where photographs disagree, all splats fade.
     pub floor: usize,
     /// Opacity below which a splat is removed.
     pub min_opacity: f32,
     /// Mean weight per frame, in pixels, below which a splat is removed.
     pub min_weight: f32,
-    /// Mean error per frame, mean absolute colour difference times pixels, from which a splat is split.
+    /// Minimum mean error per frame, mean absolute colour difference times pixels, for a splat to be split.
     pub error_threshold: f32,
-    /// Half size on screen, pixels, from which a splat is worth splitting.
+    /// Minimum half size on screen, pixels, for a splat to be worth splitting.
     pub min_extent: f32,
 }
 
@@ -71,7 +71,7 @@ pub fn densify(state: &mut SplatState, options: &FastOptions) -> DensityChange {
     }
 }
 
-/// The `count` finite splats with the largest mean weight, in order.
+/// The `count` finite splats with the largest mean weight, in ascending order of index.
 fn most_shown(state: &SplatState, count: usize) -> Vec<u32> {
     let finite = (0..state.len()).filter(|i| is_finite(&state.splats, *i));
     let mut ranked: Vec<(f32, u32)> = finite

@@ -57,7 +57,7 @@ fn pairs(state: &SplatState, options: &MergeOptions) -> Vec<(u32, u32)> {
         .into_par_iter()
         .filter(|i| {
             let other = nearest[*i as usize];
-            // None is nearest where distances overflow.
+            // There is no nearest splat if distances overflow.
             *i < other && nearest.get(other as usize) == Some(i)
         })
         .map(|i| (whole[i as usize], whole[nearest[i as usize] as usize]))
@@ -87,7 +87,7 @@ fn covariance(state: &SplatState, i: usize) -> Mat3 {
 
 /// The union of two splats.
 struct Union {
-    /// Of each of the two in the sum of their masses.
+    /// The share of each of the two in the sum of their masses.
     fractions: [f32; 2],
     mean: Vec3,
     rotation: Quat,

@@ -47,13 +47,13 @@ pub(super) fn without(kept: Vec<u32>, gone: &[u32]) -> Vec<u32> {
         .collect()
 }
 
-/// What splitting changes of a splat: offset of the mean, ln scales, opacity logit.
+/// The parameters of a splat that splitting changes: offset of the mean, ln scales, opacity logit.
 type Half = (Vec3, [f32; 3], f32);
 
 /// Splats of a parallel task.
 const PIECE: usize = 4096;
 
-/// Each of `indices` twice, adjacent, changed as `half` tells. The result does not depend on the number of threads.
+/// Each of `indices` twice, adjacent, with the changes that `half` returns. The result does not depend on the number of threads.
 fn halves(splats: &Splats, indices: &[u32], half: impl Fn(&Splats, usize, usize) -> Half + Sync) -> Splats {
     let mut halves = twice(splats, indices);
     let changes: Vec<Half> = (0..halves.len())
@@ -84,7 +84,7 @@ fn halves(splats: &Splats, indices: &[u32], half: impl Fn(&Splats, usize, usize)
 
 /// Two random samples of each of `indices`, smaller, adjacent in the result (3DGS).
 pub(super) fn random_halves(splats: &Splats, indices: &[u32], rng: &mut Rng) -> Splats {
-    /// Draws of 32 bits that a half takes: three normal variates of two each.
+    /// Draws of 32 bits per half: three normal variates of two draws each.
     const DRAWS: u64 = 6;
     let start = *rng;
     rng.advance(DRAWS * 2 * indices.len() as u64);
@@ -213,7 +213,7 @@ mod tests {
         assert_eq!(halves.log_scales.get(0, 0), splats.log_scales.get(0, 0));
     }
 
-    /// Against one splat, and one random number, after the other.
+    /// Compares with one splat, and one random number, after the other.
     #[test]
     fn random_halves_and_draws_are_those_of_one_thread() {
         let n = 3 * PIECE + 7;

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 pub struct TamingOptions {
     /// Number of splats after this round, before it removes any.
     pub target: usize,
-    /// Mean screen gradient (normalised device coordinates) from which a splat may be densified; 0.0002.
+    /// Minimum mean screen gradient (normalised device coordinates) for a splat to be densified; 0.0002.
     pub gradient_threshold: f32,
     /// World size that separates splats to clone from splats to split.
     pub small: f32,
@@ -98,8 +98,8 @@ fn select(state: &SplatState, options: &TamingOptions, scores: &[f32], rng: &mut
     })
 }
 
-/// Splats to remove, ascending: half as many as are faint or oversized are drawn among all, low scores first, and of these the
-/// faint or oversized ones are removed.
+/// Splats to remove, ascending: half as many splats as are faint or oversized are drawn from all, preferably those with low scores;
+/// of those drawn, the faint or oversized ones are removed.
 fn removed(state: &SplatState, options: &TamingOptions, scores: &[f32], rng: &mut Rng) -> Vec<u32> {
     if !options.prunes {
         return Vec::new();

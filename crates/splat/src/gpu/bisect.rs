@@ -1,4 +1,5 @@
-//! The GPU from any stage on, with the results of the CPU before it: an error is found at the first stage that makes it from right input.
+//! Runs the GPU from any stage on, with the CPU's results as input: an error is located at the first stage that produces it from
+//! correct input.
 
 use super::GpuTraining;
 use super::frame::{FRAME_PLANES, TILE};
@@ -17,7 +18,7 @@ use std::sync::Arc;
 const WORDS: usize = 12;
 /// Entries of a segment: with fewer in every tile, the backward pass needs no state of pixels between segments.
 const SEGMENT: usize = 256;
-/// What rounding, and fragments at the threshold of 1/255 that one draws and the other does not, may change of a stage's results.
+/// Largest relative difference in a stage's results due to rounding, and to fragments at the threshold of 1/255 that only one side draws.
 const ROUNDING: f64 = 1e-3;
 
 /// One step of the CPU with the results of each stage, as the shaders arrange them.
@@ -34,7 +35,7 @@ struct Twin {
     order: Vec<u32>,
     firsts: Vec<u32>,
     splat_of_slot: Vec<u32>,
-    /// Slots by tile, front to back, with the ends of each tile's.
+    /// Slots by tile, front to back, and the range of each tile.
     slots: Vec<u32>,
     ranges: Vec<[u32; 2]>,
     planes: Vec<f32>,
@@ -194,7 +195,7 @@ impl Twin {
         }
     }
 
-    /// First segments of the tiles, none of which has two.
+    /// First segments of the tiles, none of which has more than one.
     fn segments(&self) -> Vec<u32> {
         let counts = self.ranges.iter().map(|[from, to]| u32::from(to > from));
         counts
@@ -222,7 +223,7 @@ impl Twin {
         planes
     }
 
-    /// How far the results of `stage` on the device are from these, relative to their size.
+    /// Difference between the results of `stage` on the device and these, relative to the size of these.
     fn distance(&self, stage: &str, of: &GpuTraining) -> f64 {
         let (gpu, r) = (&of.renderer.gpu, &of.renderer);
         let n = self.before.len();
@@ -301,7 +302,7 @@ impl Twin {
                         .cloned()
                         .collect()
                 };
-                // What the update changed, rather than what it left.
+                // The changes by the update rather than the values after it.
                 let (before, after, got) = (columns(before), columns(after), columns(&got));
                 let changes = |of: &Planes, before: &Planes| -> Vec<f64> {
                     let pairs = of.as_slice().iter().zip(before.as_slice());
@@ -319,7 +320,7 @@ fn wide(values: &[f32]) -> Vec<f64> {
     values.iter().map(|v| f64::from(*v)).collect()
 }
 
-/// The norm of the difference relative to that of `b`; what is not a number is infinitely far.
+/// The norm of the difference relative to that of `b`; infinite for NaN.
 fn apart(a: &[f64], b: &[f64]) -> f64 {
     let norm = |values: &mut dyn Iterator<Item = f64>| values.map(|v| v * v).sum::<f64>().sqrt();
     let difference = norm(&mut a.iter().zip(b).map(|(a, b)| a - b));
@@ -353,8 +354,8 @@ fn v_out<'a>(v_color: &'a [f32], error: &'a [f32]) -> OutputGradient<'a> {
     }
 }
 
-/// The first stage whose results are not the twin's although its input is, if any, and a line for each: how far the results of all
-/// stages are from the twin's when the GPU does everything from this one on.
+/// The first stage, if any, whose results differ from the twin's although its input does not; and a line per stage with the differences
+/// of this and all later results when the GPU runs from this stage on.
 fn located(gpu: &Arc<Gpu>, faulty: Option<(&str, &str, &str)>) -> (Option<&'static str>, String) {
     let twin = Twin::new();
     let mut training = GpuTraining::new(gpu.clone()).unwrap();
@@ -378,7 +379,7 @@ fn located(gpu: &Arc<Gpu>, faulty: Option<(&str, &str, &str)>) -> (Option<&'stat
     }
     let (mut first, mut lines) = (None, String::new());
     for (at, from) in STAGES.iter().enumerate() {
-        // A whole step, which makes room for everything and sets the flags.
+        // A whole step, which allocates everything and sets the flags.
         training.upload(&twin.before, false);
         training.render(&ViewParams::new(&twin.camera), &options());
         training.backward(&v_out(&twin.v_color, &twin.error));

@@ -9,7 +9,7 @@ use std::sync::{Arc, OnceLock};
 
 /// Width and height of a tile, pixels.
 pub(super) const TILE: u32 = 16;
-/// Entries of a segment, between whose beginnings the state of pixels is kept.
+/// Entries of a segment; the state of pixels is kept at the beginnings of segments.
 const SEGMENT: usize = 256;
 /// Words of a segment's state: five channels of each pixel of a tile.
 const SEGMENT_STATE: usize = 5 * (TILE * TILE) as usize;
@@ -31,7 +31,7 @@ pub(super) mod flag {
     pub const CAMERA: u32 = 256;
 }
 
-/// A renderer on the GPU: the twin of [`crate::Renderer`], with its conventions and formulas; sums are rounded in another order.
+/// A renderer on the GPU: the twin of [`crate::Renderer`], with its conventions and formulas; sums are computed in another order.
 pub struct GpuRenderer {
     pub(super) gpu: Arc<Gpu>,
     pub(super) kernels: Kernels,
@@ -58,7 +58,7 @@ pub struct GpuRenderer {
     pub(super) reached: Array,
     pub(super) states: Array,
     pub(super) planes: Array,
-    /// Of visible splats, in their own order, then front to back.
+    /// Place of each visible splat among the visible ones: first in their own order, then front to back.
     pub(super) places: Array,
     depths: Array,
     counts: Array,
@@ -68,13 +68,15 @@ pub struct GpuRenderer {
     scan_params: [Array; 3],
     sort_depths: Sort,
     sort_tiles: Sort,
-    /// Visible splats, then entries, each in a part of its own.
+    /// Numbers of visible splats and of entries, each in its own part of `all_counted`.
     counted: [Array; 2],
     all_counted: Array,
-    /// Entries of tiles for which there is room.
+    /// Number of tile entries for which there is room.
     room: usize,
     readback: Readback,
     pub(super) last: Option<Last>,
+    /// Non-finite gradients that a void frame reported: its repetition counts from zero again.
+    void_non_finite: usize,
     host: OnceLock<Vec<f32>>,
 }
 
@@ -85,11 +87,11 @@ pub(super) struct Last {
     pub options: RenderOptions,
     /// Whether the backward pass may follow.
     pub trains: bool,
-    /// Entries of tiles for which there is room.
+    /// Number of tile entries for which there is room.
     pub room: usize,
-    /// Visible splats and entries of tiles, once the host knows.
+    /// Numbers of visible splats and of entries of tiles, once the host knows them.
     pub found: [usize; 2],
-    /// Splats whose gradient was not finite in the backward pass before this frame, once the host knows.
+    /// Number of splats whose gradient was not finite in the backward pass before this frame, once the host knows it.
     pub non_finite: usize,
 }
 
@@ -107,7 +109,7 @@ impl Last {
         x as usize * y as usize
     }
 
-    /// Segments at most.
+    /// Maximum number of segments.
     pub fn segments(&self) -> usize {
         self.room / SEGMENT + self.tile_count()
     }
@@ -157,6 +159,7 @@ impl GpuRenderer {
             sort_depths: Sort::new(&gpu, 32),
             sort_tiles: Sort::new(&gpu, 32),
             last: None,
+            void_non_finite: 0,
             host: OnceLock::new(),
             gpu,
         };
@@ -169,7 +172,7 @@ impl GpuRenderer {
         &self.gpu
     }
 
-    /// Takes the splats of the frames to come, and the variances of their 3D smoothing filter, if any.
+    /// Uploads the splats of the next frames, and the variances of their 3D smoothing filter, if any.
     pub fn upload(&mut self, splats: &Splats, filter: &[f32]) {
         self.harmonics.reserve(&self.gpu, splats.sh.as_slice().len());
         self.harmonics.write(&self.gpu, 0, splats.sh.as_slice());
@@ -178,7 +181,7 @@ impl GpuRenderer {
         self.last = None;
     }
 
-    /// Takes everything but the harmonics, of which there is room for `degree`.
+    /// Uploads everything but the harmonics, whose array has room for `degree`.
     pub(super) fn upload_geometry(&mut self, splats: &Splats, filter: &[f32], degree: usize) {
         let (gpu, stride) = (&self.gpu, splats.stride());
         self.shape = [splats.len(), stride, degree];
@@ -205,7 +208,7 @@ impl GpuRenderer {
         self.draw_whole(view, options, false);
     }
 
-    /// As [`Self::render`]; if it `trains`, the backward pass may follow.
+    /// As [`Self::render`]; if `trains` is set, the backward pass may follow.
     pub(super) fn draw_whole(&mut self, view: &ViewParams, options: &RenderOptions, trains: bool) {
         loop {
             self.draw(view, options, trains);
@@ -215,8 +218,8 @@ impl GpuRenderer {
         }
     }
 
-    /// Waits until the last frame knows what it found. If tiles had more entries than there was room for, it makes room: `false`, the frame
-    /// is void, as is everything made from it since, and is to be repeated.
+    /// Waits for the last frame's numbers of visible splats and of entries. If there was no room for all entries, makes room and returns
+    /// `false`: the frame and everything derived from it are void and must be repeated.
     pub(crate) fn settle(&mut self) -> bool {
         let Some(last) = self.last.as_mut().filter(|_| self.readback.is_pending()) else {
             return true;
@@ -225,7 +228,10 @@ impl GpuRenderer {
         self.readback.take(&self.gpu, &mut found);
         let [visible, entries, non_finite, _] = found.map(|n| n as usize);
         last.found = [visible, entries];
-        last.non_finite = non_finite;
+        last.non_finite = non_finite.max(std::mem::take(&mut self.void_non_finite));
+        if entries > last.room {
+            self.void_non_finite = last.non_finite;
+        }
         // An eighth more, since the next view may need it.
         if entries + entries / 8 > self.room {
             self.room = entries + entries / 4;
@@ -233,13 +239,13 @@ impl GpuRenderer {
         entries <= last.room
     }
 
-    /// Submits a frame. How many splats are visible and how many entries their tiles have stays on the device: arrays have room for the
-    /// most so far, and what is dispatched suffices for that. [`Self::settle`] follows.
+    /// Submits a frame. The numbers of visible splats and of tile entries stay on the device: arrays have room for the most so far, and
+    /// enough workgroups are dispatched for that many. [`Self::settle`] must follow.
     pub(super) fn draw(&mut self, view: &ViewParams, options: &RenderOptions, trains: bool) {
         let gpu = self.gpu.clone();
         let [count, ..] = self.shape;
         self.host = OnceLock::new();
-        // What is next to nothing, to begin with.
+        // One entry per splat to begin with, which takes little memory.
         self.room = self.room.max(count);
         let last = Last {
             view: view.clone(),
@@ -253,7 +259,7 @@ impl GpuRenderer {
         for array in [&mut self.tiles, &mut self.slots, &mut self.splat_of_slot] {
             array.reserve(&gpu, last.room);
         }
-        // Behind the tiles, what belongs to none.
+        // After the tiles, one range for entries that belong to none.
         self.ranges.reserve(&gpu, 2 * (tiles + 1));
         for array in [&mut self.segment_counts, &mut self.first_segments, &mut self.reached] {
             array.reserve(&gpu, tiles + 1);
@@ -273,7 +279,7 @@ impl GpuRenderer {
         self.last = Some(last);
     }
 
-    /// Splats to footprints, and how many tiles each touches.
+    /// Projects splats to footprints, and counts the tiles that each touches.
     pub(super) fn project(&self, work: &mut Work) {
         work.clear(&self.found, 2);
         work.run(
@@ -292,7 +298,7 @@ impl GpuRenderer {
         );
     }
 
-    /// Footprints to the lists of all tiles, front to back, and to the segments of these lists.
+    /// Builds the lists of all tiles, front to back, from the footprints, and the segments of these lists.
     pub(super) fn bin(&mut self, work: &mut Work, last: &Last) {
         let [count, ..] = self.shape;
         let tiles = last.tile_count();
@@ -320,7 +326,7 @@ impl GpuRenderer {
             &[&self.view, &self.order, &self.touched, &self.counts, &self.places],
             groups(count),
         );
-        // What lies beyond the visible splats is added to nothing.
+        // Counts beyond the visible splats are stale, but are in no sum that is used.
         self.scan
             .run(work, &self.scan_params[1], &self.counts, &self.firsts, count);
         work.run(
@@ -360,7 +366,7 @@ impl GpuRenderer {
         );
     }
 
-    /// The lists of tiles to pixels.
+    /// Blends the lists of tiles into pixels.
     pub(super) fn blend(&self, work: &mut Work, last: &Last) {
         work.run(
             &self.kernels.blend,
@@ -380,7 +386,7 @@ impl GpuRenderer {
         );
     }
 
-    /// What the backward pass needs beyond what the frame needed.
+    /// Sets the flags that the backward pass needs in addition to the frame's.
     pub(super) fn add_flags(&self, last: &Last, more: u32) {
         let at = VIEW_WORDS - 4;
         self.view.write(&self.gpu, at, &[self.view_words(last)[at] | more]);
@@ -403,7 +409,7 @@ impl GpuRenderer {
         }
     }
 
-    /// SH degree for which there is room.
+    /// SH degree for which the harmonics have room.
     pub(crate) fn sh_degree(&self) -> u32 {
         self.shape[2] as u32
     }
@@ -423,12 +429,12 @@ impl GpuRenderer {
         self.last.as_ref().map_or(0, |last| last.found[1])
     }
 
-    /// Splat-pixel pairs of the last frame, pixels in whole tiles.
+    /// Splat-pixel pairs of the last frame, counting all pixels of each touched tile.
     pub fn pairs(&self) -> u64 {
         self.intersections() as u64 * u64::from(TILE * TILE)
     }
 
-    /// The words of `View`, before anything is found.
+    /// The words of `View` before projection, with nothing found yet.
     fn view_words(&self, last: &Last) -> [u32; VIEW_WORDS] {
         let Last {
             view, options, trains, ..
@@ -450,7 +456,7 @@ impl GpuRenderer {
             (true, flag::CLAMP),
             (*trains, flag::TRAINS),
         ];
-        // As the twin draws whole chunks.
+        // Whole chunks, as drawn by the twin.
         let drawn = options
             .first
             .div_ceil(crate::render::CHUNK)
@@ -485,7 +491,7 @@ impl GpuRenderer {
 /// Words of `View` in `view.wgsl`.
 const VIEW_WORDS: usize = 44;
 
-/// Workgroups for so many items.
+/// Number of workgroups for `items` items.
 fn groups(items: usize) -> usize {
     items.div_ceil(GROUP as usize)
 }

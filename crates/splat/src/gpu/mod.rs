@@ -1,8 +1,8 @@
 //! Splats on any GPU: the stages of [`crate::render`] and of an update as compute shaders.
 //!
-//! Visible splats are sorted by depth, then their tiles by number, stably. Each splat's gradients in a tile are summed by one thread,
-//! in the order of pixels, and its tiles in their order: the same bytes from run to run on the same device. Drivers may round
-//! differently from the CPU; what differs is rounding alone.
+//! Visible splats are sorted by depth, then their tiles by number, stably. Each splat's gradients are summed in a fixed order in each
+//! tile, then over its tiles in their order, so that results have the same bytes from run to run on the same device. They differ from
+//! the CPU's by rounding only.
 
 mod frame;
 mod moves;

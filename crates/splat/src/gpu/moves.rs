@@ -1,8 +1,8 @@
 //! Density control that leaves harmonics and moments on the device.
 //!
-//! Density control decides by geometry and statistics; harmonics and moments, nine tenths of a state, are only kept, moved, copied and
-//! set to zero. In the state that it edits here, each of their columns is a single plane with the number of each row. Whatever
-//! moves a column moves the numbers, without knowing, and `move_rows.wgsl` then does the same to the column on the device.
+//! Density control depends on geometry and statistics; harmonics and moments, nine tenths of a state, are only kept, moved, copied and
+//! set to zero. In the state that it edits here, each of their columns is a single plane with the number of each row. Code that moves
+//! a column thus moves the numbers, and `move_rows.wgsl` then moves the rows of the column on the device in the same way.
 
 use super::frame::GEOMETRY;
 use super::training::GpuTraining;
@@ -12,11 +12,11 @@ use irradia_compute::gpu::{Array, GROUP, Gpu, Work};
 use irradia_scene::sh;
 use rayon::prelude::*;
 
-/// What moving rows needs of its own.
+/// Working memory for moving rows.
 pub(super) struct Moves {
     /// Row numbers of the columns, plane by plane.
     numbers: Array,
-    /// Where a column goes; it then changes places with the one before.
+    /// Destination of a moved column, which is then swapped with the column's own array.
     spare: Array,
 }
 
@@ -38,7 +38,7 @@ fn numbered(count: usize) -> Planes {
     planes
 }
 
-/// Whether every row is where it was.
+/// Whether no row has moved.
 fn is_unmoved(numbers: &Planes) -> bool {
     let of_rows = numbers.plane(0)[..numbers.len()].par_iter().enumerate();
     of_rows
@@ -47,7 +47,7 @@ fn is_unmoved(numbers: &Planes) -> bool {
 }
 
 impl GpuTraining {
-    /// The state with row numbers for harmonics and moments. Second moments, which move as first ones, have no planes.
+    /// The state with row numbers for harmonics and moments. Second moments have no planes, since they move like the first ones.
     pub fn download_numbered(&self) -> SplatState {
         let count = self.renderer.shape[0];
         let mut state = SplatState {
@@ -65,7 +65,7 @@ impl GpuTraining {
         state
     }
 
-    /// Takes an edited state of [`Self::download_numbered`].
+    /// Applies an edited state of [`Self::download_numbered`].
     pub fn upload_numbered(&mut self, state: &SplatState) {
         let [before, stride_before, degree] = self.renderer.shape;
         let columns = [&state.splats.sh].into_iter().chain(state.moments[0].columns());
@@ -89,7 +89,7 @@ impl GpuTraining {
         }
         let mut work = Work::new(&gpu);
         let kernel = &self.renderer.kernels.move_rows;
-        // Parts of an array: column of the numbers, first plane, planes.
+        // Parts of an array: column of the numbers, first plane, number of planes.
         let mut gather = |array: &mut Array, parts: &[[usize; 3]]| {
             spare.reserve(&gpu, parts.iter().map(|[.., planes]| planes * stride).sum());
             for [column, first, planes] in parts {

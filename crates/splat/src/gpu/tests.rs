@@ -27,7 +27,7 @@ fn every_shader_is_valid() {
     }
 }
 
-/// `n` splats of all sizes about the origin, some behind the camera, a few needles, and a camera with an awkward lens.
+/// `n` splats of all sizes around the origin, some behind the camera, a few needles, and a camera with unusual intrinsics.
 pub(super) fn scene(n: usize, degree: u32, seed: u64) -> (Splats, Camera) {
     let mut rng = Rng::new(seed, 7);
     let mut splats = Splats::zeros(n, degree);
@@ -90,7 +90,7 @@ fn frames_agree_with_the_cpu() {
                 ("alpha", got.alpha, expected.alpha, 2e-4),
                 ("depth", got.depth, expected.depth, 2e-3),
             ] {
-                // Where rounding decides whether a fragment of alpha 1/255 is drawn, a pixel differs by as much.
+                // Where rounding decides whether a fragment of alpha 1/255 is drawn, a pixel may differ by that much.
                 let (largest, beyond) = apart(got, expected, most);
                 assert!(
                     beyond < 2e-3 && largest < 0.05,
@@ -116,7 +116,7 @@ fn the_same_frame_has_the_same_bytes() {
     assert!(frame() == frame());
 }
 
-/// What the loss of a frame might be.
+/// Random gradients of a frame: colour, alpha, depth; and an error per pixel.
 pub(super) fn gradients(camera: &Camera, seed: u64) -> [Vec<f32>; 4] {
     let pixels = camera.intrinsics.width as usize * camera.intrinsics.height as usize;
     let mut rng = Rng::new(seed, 9);
@@ -196,7 +196,7 @@ fn gradients_agree_with_the_cpu() {
     gpu.check().unwrap();
 }
 
-/// Of every parameter, with the norms of screen gradients as statistics.
+/// An update of every parameter, with the norms of screen gradients as statistics.
 pub(super) fn usual_update() -> Update {
     Update {
         statistics: Some(Statistics::Gradient),
@@ -218,7 +218,7 @@ pub(super) fn usual_update() -> Update {
             step: AdamStep {
                 beta1: 0.9,
                 beta2: 0.999,
-                // Where a gradient is rounding alone, Adam would make a whole step of it.
+                // With a smaller one, Adam would make a full step of a gradient that is only rounding error.
                 epsilon: 1e-8,
                 step: 1,
             },
@@ -372,7 +372,7 @@ fn noise_moves_faint_splats_by_the_given_amount_and_opaque_ones_not_at_all() {
     assert!((deviation / 0.0062 - 1.0).abs() < 0.05, "{deviation}");
 }
 
-/// Every strategy, each on both ways: harmonics and moments stay on the device, or the whole state is read back, edited and uploaded.
+/// Every strategy in both ways: harmonics and moments stay on the device, or the whole state is read back, edited and uploaded.
 #[test]
 fn density_control_with_harmonics_on_the_device_gives_the_same_bits_as_the_whole_state_read_back() {
     type Edit = fn(&mut SplatState);

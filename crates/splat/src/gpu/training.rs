@@ -11,13 +11,13 @@ use irradia_compute::{DeviceError, Planes};
 use irradia_scene::sh;
 use std::sync::Arc;
 
-/// Gradients of each splat, planes: geometry, colour, screen, gathered.
+/// Planes of the splats' gradients: geometry, colour, screen, gathered.
 pub(super) const GRADIENTS: usize = GEOMETRY + 7;
-/// Sums of blending of each slot.
+/// Sums of blending per slot.
 const SUMS: usize = 12;
 /// Threads of a workgroup of `project_vjp.wgsl`, which needs many registers.
 const VJP_GROUP: usize = 64;
-/// Gradients of the camera of each visible splat.
+/// Components of the camera's gradient, for each visible splat.
 const CAMERA: usize = 15;
 
 /// Bits of `Update.flags` in `update.wgsl`.
@@ -42,7 +42,7 @@ pub struct DeviceGradient {
     pub depth: bool,
     /// What else to accumulate per splat, for these statistics.
     pub gather: Option<Statistics>,
-    /// Whether the camera's gradient is wanted.
+    /// Whether to compute the camera's gradient.
     pub camera: bool,
 }
 
@@ -86,8 +86,8 @@ impl GpuTraining {
         })
     }
 
-    /// Splats of `degree` at most, by the device's largest array: what a state needs, and what frames need with as many entries a splat as
-    /// the last one, or twice as many, since views differ.
+    /// Maximum number of splats of `degree` for which the device's largest array suffices: for a state, and for frames with twice as many
+    /// entries per splat as the last one, since views differ.
     pub fn most_splats(&self, degree: u32) -> usize {
         let words = (self.renderer.gpu.info().largest_array / 4) as usize;
         let by_state = words / (3 * sh::coefficients(degree)).max(2 * GEOMETRY);
@@ -100,7 +100,7 @@ impl GpuTraining {
         by_state.saturating_sub(Planes::ALIGN).min(by_entries).max(1)
     }
 
-    /// Takes the whole state.
+    /// Uploads the whole state.
     pub fn upload(&mut self, state: &SplatState, filters: bool) {
         self.renderer.upload(&state.splats, state.filter.plane(0));
         self.renderer.filters = filters;
@@ -123,7 +123,7 @@ impl GpuTraining {
         self.v_splats.reserve(gpu, GRADIENTS * state.splats.stride());
     }
 
-    /// The state as it is now.
+    /// Reads back the whole state.
     pub fn download(&self) -> SplatState {
         let gpu = &self.renderer.gpu;
         let [count, _, degree] = self.renderer.shape;
@@ -142,7 +142,7 @@ impl GpuTraining {
         state
     }
 
-    /// Reads what density control decides by: geometry, statistics and filter.
+    /// Reads the columns on which density control depends: geometry, statistics and filter.
     pub(super) fn download_decisive(&self, state: &mut SplatState) {
         let gpu = &self.renderer.gpu;
         let count = self.renderer.shape[0];
@@ -166,7 +166,7 @@ impl GpuTraining {
         self.renderer.draw(view, options, true);
     }
 
-    /// The planes of the last frame, and room for those of its gradients: red, green, blue, alpha, depth, and the error to gather.
+    /// The planes of the last frame, and an array for those of its gradients: red, green, blue, alpha, depth, and the error to gather.
     pub fn frame_and_gradients(&mut self) -> [&Array; 2] {
         let pixels = self.renderer.last.as_ref().expect("render comes first").pixels();
         self.v_frame.reserve(&self.renderer.gpu, (FRAME_PLANES + 1) * pixels);
@@ -201,7 +201,7 @@ impl GpuTraining {
         });
     }
 
-    /// As [`Self::backward`], of the gradients that [`Self::frame_and_gradients`] received.
+    /// As [`Self::backward`], with the gradients written to the array of [`Self::frame_and_gradients`].
     pub fn propagate(&mut self, of: &DeviceGradient) {
         let renderer = &mut self.renderer;
         let last = renderer.last.clone().expect("render comes first");
@@ -229,7 +229,7 @@ impl GpuTraining {
         self.camera = of.camera.then(|| self.sum_camera(&last));
     }
 
-    /// Gradients of pixels to sums of each slot.
+    /// From the gradients of pixels to the sums of each slot.
     pub(super) fn blend_vjp(&self, work: &mut Work, last: &Last) {
         let renderer = &self.renderer;
         work.run(
@@ -252,7 +252,7 @@ impl GpuTraining {
         );
     }
 
-    /// Sums of slots to gradients of splats.
+    /// From the sums of slots to the gradients of splats.
     pub(super) fn project_vjp(&self, work: &mut Work) {
         let renderer = &self.renderer;
         work.clear(&renderer.found.part(2, 1), 1);
@@ -277,7 +277,7 @@ impl GpuTraining {
         );
     }
 
-    /// Sums the camera's gradients: those of 256 splats on the device, then these in order, in double precision.
+    /// Sums the camera's gradients: over 256 splats each on the device, then these sums in order, in double precision.
     fn sum_camera(&mut self, last: &Last) -> CameraGradient {
         let gpu = &self.renderer.gpu;
         let groups = last.found[0].div_ceil(GROUP as usize);
@@ -312,7 +312,7 @@ impl GpuTraining {
         self.camera
     }
 
-    /// Reads the gradients of the last backward pass back; those of colours are spread over the harmonics here.
+    /// Reads back the gradients of the last backward pass; those of the harmonics are computed here from those of colours.
     pub fn read_gradients(&self, gradients: &mut SplatGradients) {
         let gpu = &self.renderer.gpu;
         let [count, stride, degree] = self.renderer.shape;
@@ -451,7 +451,7 @@ impl GpuTraining {
         words
     }
 
-    /// The size below which splats rest: all but the largest `fraction` of the visible ones, as `regularize::freeze_small` has it.
+    /// The size below which splats are frozen: all but the largest `fraction` of the visible ones, as in `regularize::freeze_small`.
     fn frozen_below(&self, fraction: f32) -> Option<f32> {
         let gpu = &self.renderer.gpu;
         let [count, stride, _] = self.renderer.shape;

@@ -191,7 +191,7 @@ impl BlendTile<'_> {
     }
 }
 
-/// How many entries ahead footprints are fetched: in depth order they are far apart in memory.
+/// How many entries ahead footprints are prefetched: in depth order they are far apart in memory.
 const AHEAD: usize = 8;
 
 /// The bits of `blocks` in `band`, from bit 0.

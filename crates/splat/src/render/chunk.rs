@@ -25,10 +25,10 @@ where
     }
 }
 
-/// How many splats ahead geometry is fetched.
+/// How many splats ahead geometry is prefetched.
 const AHEAD: usize = 64;
 
-/// Fetches what [`load_geometry`] will read.
+/// Prefetches what [`load_geometry`] will read.
 #[inline(always)]
 fn prefetch_geometry<S: Simd>(simd: S, splats: &Splats, at: usize) {
     let at = at.min(splats.stride() - 1);
@@ -58,7 +58,7 @@ pub(super) struct ChunkJob<'a> {
     pub chunk: usize,
     pub footprints: &'a mut [Footprint2d],
     pub depth_keys: &'a mut [u32],
-    /// Number of its visible splats, to be written.
+    /// Output: number of its visible splats.
     pub visible: &'a mut u32,
 }
 
@@ -106,7 +106,7 @@ impl ProjectPart<'_, '_> {
         let job = &mut self.jobs[job];
         let base = job.chunk * CHUNK;
         let mut harmonics = Harmonics::new(degree);
-        // The footprints' numbers, each in a row.
+        // The fields of the footprints, one row each.
         let mut columns = [[0.0f32; CHUNK]; 9];
         let mut shown = [0u32; CHUNK / 4];
         job.depth_keys.fill(u32::MAX);
@@ -184,7 +184,7 @@ impl ProjectPart<'_, '_> {
     }
 }
 
-/// What a chunk's backward pass leaves beside the columns.
+/// Results of a chunk's backward pass other than the columns.
 #[derive(Clone, Copy, Default)]
 pub(super) struct ChunkOutcome {
     /// Splats skipped because a gradient was not finite.
@@ -193,7 +193,7 @@ pub(super) struct ChunkOutcome {
     pub camera: CameraGradient,
 }
 
-/// Runs of splats of all planes of [`SplatGradients`], and of what is kept chunk by chunk; can be split among threads.
+/// A run of splats in all planes of [`SplatGradients`] and in the arrays kept per chunk; can be split among threads.
 pub(super) struct GradientRun<'a> {
     pub active: &'a mut [f32],
     pub screen: [&'a mut [f32]; 2],
@@ -202,7 +202,7 @@ pub(super) struct GradientRun<'a> {
     pub quats: [&'a mut [f32]; 4],
     pub log_scales: [&'a mut [f32]; 3],
     pub opacity_logits: [&'a mut [f32]; 1],
-    /// As many as there are; the others are empty.
+    /// One slice per plane in use; the others are empty.
     pub sh: [&'a mut [f32]; 3 * MAX_COEFFICIENTS],
     /// Number of active splats, chunk by chunk.
     pub counts: &'a mut [u32],

@@ -10,7 +10,7 @@ use irradia_compute::simd::{Kernel, Lanes, Level, Simd};
 use irradia_compute::unroll;
 use rayon::prelude::*;
 
-/// What encloses the splats of a chunk.
+/// Bounds of the splats of a chunk.
 #[derive(Clone, Copy, Debug, Default)]
 struct Bound {
     /// The box of the means, world.
@@ -47,7 +47,7 @@ impl ChunkBounds {
     /// For each chunk, whether `view` may see some of its splats.
     pub(super) fn seen(&self, view: &ViewParams, seen: &mut Vec<bool>) {
         let planes = view_planes(view);
-        // The sides of a lens's image are no planes: there only what is behind the camera is left out, if the lens does not show it.
+        // The sides of a lens's image are not planes: only chunks behind the camera are left out, unless the lens shows them.
         let planes = match &view.lens {
             None => &planes[..],
             Some(lens) if lens.is_wide() => &[],
@@ -105,7 +105,7 @@ impl Kernel for Enclose<'_> {
     }
 }
 
-/// A half space of splats that cannot be seen: `normal . mean + per_deviation s + offset < 0`.
+/// A half space in which splats cannot be seen: `normal . mean + per_deviation s + offset < 0`.
 struct Plane {
     normal: [f64; 3],
     per_deviation: f64,
@@ -114,14 +114,14 @@ struct Plane {
 
 /// A footprint's half size is at most this many standard deviations on the image: sqrt(2 ln 255) = 3.33, and 2 % for rounding.
 const REACH: f64 = 3.4;
-/// And this many pixels for the dilation, sqrt(2 ln 255 times 0.3) = 1.82, and for the half pixel to the outermost centre; the
+/// Pixels added to that for the dilation, sqrt(2 ln 255 times 0.3) = 1.82, and for the half pixel to the outermost centre; the
 /// rest is for rounding.
 const MARGIN: f64 = 2.0;
 /// Relative rounding of a projected coordinate in single precision, several times over.
 const ROUNDING: f64 = 1e-5;
 
 impl Plane {
-    /// NaN excludes nothing.
+    /// Whether no splat within `bound` can be seen; false if a bound is NaN.
     fn excludes(&self, bound: &Bound) -> bool {
         let (mut highest, mut size) = (0.0f64, self.offset.abs());
         for c in 0..3 {

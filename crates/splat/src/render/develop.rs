@@ -1,5 +1,5 @@
-//! From the tiles' order of pixels to the image's, and the gradients of the image back to the tiles'. Kernels only so that the
-//! compiler uses wide instructions.
+//! Brings pixels from the tiles' order into the image's, and the gradients of the image back into the tiles' order. These are kernels
+//! only so that the compiler uses wide instructions.
 
 use super::bin::{BAND_BLOCKS, BLOCK_HEIGHT, BLOCK_WIDTH, TILE};
 use super::blend::{BLOCK, CHANNELS, TILE_PIXELS};
@@ -87,13 +87,13 @@ pub(super) struct GatherTile<'a> {
     pub state: &'a [f32; CHANNELS * TILE_PIXELS],
     pub v_out: &'a OutputGradient<'a>,
     pub background: [f32; 3],
-    /// Of the image.
+    /// Width and height of the image, pixels.
     pub size: [usize; 2],
     /// The tile's first column and row.
     pub corner: [usize; 2],
-    /// As [`super::blend::BlendTileVjp::v_out`]; zero before.
+    /// As [`super::blend::BlendTileVjp::v_out`]; zeros on entry.
     pub v_tile: &'a mut [f32; CHANNELS * TILE_PIXELS],
-    /// As [`super::blend::BlendTileVjp::rest`]; zero before.
+    /// As [`super::blend::BlendTileVjp::rest`]; zeros on entry.
     pub rest: &'a mut [f32; TILE_PIXELS],
 }
 

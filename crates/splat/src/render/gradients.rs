@@ -48,7 +48,8 @@ fn geometry(flat: &[f64]) -> Geometry<f64> {
     }
 }
 
-/// Distortion, rational, and so strong that the limit is within the image; a fisheye with a prism; the model of the field of view; a panorama.
+/// A rational distortion, and one so strong that the limit is within the image; a fisheye with a thin prism; the field-of-view model; a
+/// panorama.
 const LENSES: [Lens; 5] = [
     Lens::Opencv {
         k: [0.12, -0.08, 0.01, 0.02, 0.01, 0.0],
@@ -67,7 +68,7 @@ const LENSES: [Lens; 5] = [
     Lens::Equirectangular,
 ];
 
-/// Lenses of cameras that move while they are read out, from each side: of a pinhole, a distorted lens and two wide ones.
+/// Lenses of cameras with rolling shutters, one for each side at which the readout begins: a pinhole, a distorted lens and two wide ones.
 const MOVING: [(Lens, FirstSide); 4] = [
     (Lens::Pinhole, FirstSide::Top),
     (LENSES[0], FirstSide::Right),
@@ -106,7 +107,8 @@ fn camera(view: &ViewParams, lens: Lens, shutter: Option<RollingShutter>) -> Cam
 }
 
 impl Scene {
-    /// One of six configurations with an image of this size, by a pinhole for `seed` 1 to 6, by a lens for 7 to 11, by a moving camera for 12 to 15.
+    /// One of six configurations with an image of this size: with a pinhole for `seed` 1 to 6, a lens for 7 to 11, a moving camera for
+    /// 12 to 15.
     fn new(seed: u64, width: u32, height: u32) -> Self {
         let (antialias, filter, degree) = [
             (false, None, 3),
@@ -122,7 +124,7 @@ impl Scene {
             at @ 7..=11 => (LENSES[at - 7], None),
             at => (MOVING[at - 12].0, Some(moving(MOVING[at - 12].1))),
         };
-        // Wide lenses show what is behind the camera as well.
+        // Wide lenses also show what is behind the camera.
         let scale = f64::from(width) / 21.0;
         let zoom = if lens.is_wide() { 0.4 } else { 1.0 };
         let mut view = ViewParams {
@@ -296,8 +298,8 @@ impl Scene {
         (gradients, self.view.gradient(v_rotation, v_translation, v_center))
     }
 
-    /// Each pixel's smallest distance of a fragment from one of the hard decisions: a finite difference across one is invalid,
-    /// and rounding may decide either way.
+    /// For each pixel, the smallest distance of a fragment from a hard decision: a finite difference across one is invalid, and
+    /// rounding may decide either way.
     fn margins(&self, splats: &[Flat]) -> Vec<f64> {
         let projected = self.project(splats);
         let mut margins = Vec::new();
@@ -322,7 +324,7 @@ impl Scene {
         margins
     }
 
-    /// The sums over each splat of its blending weights times `error`, an error per pixel, and of its blending weights.
+    /// For each splat, the sum of its blending weights times `error`, an error per pixel, and the sum of its blending weights.
     fn gathered(&self, splats: &[Flat], error: &[f64]) -> Vec<[f64; 2]> {
         let projected = self.project(splats);
         let mut sums = vec![[0.0; 2]; splats.len()];
@@ -444,7 +446,8 @@ fn every_gradient_matches_finite_differences() {
     assert!(compared > 1000);
 }
 
-/// The renderer's own code for lenses and shutters against those of cameras, before and behind them, and the limit of a lens that folds.
+/// Compares the renderer's own code for lenses and shutters with that of cameras, for points in front of and behind them; includes the
+/// limit of a lens that folds.
 #[test]
 fn a_lens_shows_points_where_its_camera_has_them() {
     let still = LENSES.map(|lens| (lens, None));
@@ -457,7 +460,7 @@ fn a_lens_shows_points_where_its_camera_has_them() {
         let (mut shown, mut rng) = (0, Rng::new(5, 5));
         for _ in 0..1000 {
             let point = [0; 3].map(|_| f64::from(rng.range(-2.0, 2.0)));
-            // Next to a moving camera the direction of the middle row says nothing of others.
+            // Close to a moving camera, the direction from the middle row says nothing about that from other rows.
             if shutter.is_some() && DVec3::from(point).length() < 1.0 {
                 continue;
             }
@@ -474,7 +477,7 @@ fn a_lens_shows_points_where_its_camera_has_them() {
                     "{lens:?} {point:?}: {apart}"
                 );
             } else if let Some((pixel, _)) = ours {
-                // What a lens is continued by is outside the image.
+                // The continuation of a lens beyond its limit is outside the image.
                 let [x, y] = [pixel[0] / f64::from(k.width), pixel[1] / f64::from(k.height)];
                 assert!(
                     !((0.01..0.99).contains(&x) && (0.01..0.99).contains(&y)),
@@ -486,11 +489,11 @@ fn a_lens_shows_points_where_its_camera_has_them() {
     }
 }
 
-/// The whole renderer, with its own loops over chunks, tiles, blocks and lanes, against the simple loops above.
+/// Compares the whole renderer, with its own loops over chunks, tiles, blocks and lanes, with the simple loops above.
 #[test]
 fn every_level_matches_double_precision() {
     for seed in 1..=SEEDS {
-        // Four tiles, complete or three cut by the image's border; 66 splats do not fill a whole number of vectors.
+        // Four tiles, all complete or three of them cut by the image's border; 66 splats do not fill a whole number of vectors.
         let whole = seed % 2 == 0;
         let (width, height) = if whole { (64, 64) } else { (63, 54) };
         let mut scene = Scene::new(seed, width, height);
@@ -596,7 +599,7 @@ fn every_level_matches_double_precision() {
                     .collect();
                 let d = relative_difference(&values, &want, 1e-3);
                 println!("{}: {:.1e}", what(name), d.worst);
-                // Single precision, over some thousand pixels per splat: 9e-4 was seen.
+                // Single precision, over some thousand pixels per splat: the largest difference seen was 9e-4.
                 assert!(d.worst < 2e-3, "{}: {d:?}", what(name));
             }
             for (i, want) in want_collected.iter().enumerate().filter(|(i, _)| got.active[*i] > 0.0) {

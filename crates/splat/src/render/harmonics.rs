@@ -12,7 +12,7 @@ use irradia_scene::sh::coefficients;
 /// Splats per task of projection: a multiple of every vector length, and small enough for the buffers to stay in cache.
 pub const CHUNK: usize = irradia_compute::adam::RUN;
 
-/// The plane after `plane` from splat `first` on, to be fetched while that one is read: a chunk reads more planes in turn than the
+/// The plane after `plane` from splat `first` on, to be prefetched while `plane` is read: a chunk reads more planes in turn than the
 /// processor's prefetchers follow.
 #[inline(always)]
 fn next_plane(splats: &Splats, plane: usize, first: usize) -> &[f32] {

@@ -1,5 +1,5 @@
-//! What a frame consists of, for people: the number of splats in each pixel, splats as solid ellipses or rings, and the splats
-//! at one pixel. All of it reads the projection and the bins of the last frame, so that it shows what was drawn.
+//! Inspection of a frame: the number of splats in each pixel, splats as solid ellipses or rings, and the splats at one pixel. All of
+//! it reads the projection and the bins of the last frame, so that it shows what was drawn.
 //!
 //! `m` is the squared Mahalanobis distance of a pixel to a splat's centre, in standard deviations of its footprint.
 
@@ -31,7 +31,7 @@ pub struct Hit {
     pub weight: f32,
     /// Depth of its centre along +Z, world units.
     pub depth: f32,
-    /// Its colour from here, after clamping at 0.
+    /// Its colour as seen from the camera, after clamping at 0.
     pub color: [f32; 3],
 }
 

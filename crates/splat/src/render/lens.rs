@@ -1,5 +1,5 @@
-//! Projection through a lens: the mean goes where the lens shows it, and the Gaussian around it by the lens's Jacobian there, as EWA splatting
-//! (Zwicker et al. 2001) has it for the pinhole. Photographs of distorted cameras can be trained on as they are.
+//! Projection through a lens: of the mean exactly, and of the Gaussian around it by the lens's Jacobian at the mean, as in EWA splatting
+//! (Zwicker et al. 2001) for the pinhole. This allows training on distorted photographs as they are.
 //!
 //! Lenses are written once, as functions of [`Jet`]s, which carry first and second derivatives along: the Jacobian needs the first, its
 //! vector-Jacobian product the second.
@@ -11,10 +11,11 @@ use irradia_compute::unroll;
 use irradia_scene::{Camera, Lens, RollingShutter};
 use std::ops::{Add, Mul};
 
-/// Perspective lenses are evaluated up to this multiple of the radius that the image's corners have on the undistorted plane; beyond it they are
-/// continued by their tangent, as gsplat limits the Jacobian of pinholes. Beyond a fold they show nothing.
+/// Perspective lenses are evaluated up to this multiple of the largest radius of the image's border on the undistorted plane; beyond it
+/// they are continued by their tangent, similar to gsplat's limit on the Jacobian of pinholes. Beyond a fold they show nothing.
 const BEYOND_CORNERS: f64 = 1.3;
-/// What the camera of the middle row does not see may be seen by others: wide lenses that move are evaluated up to this multiple of their angle.
+/// Points that the middle row's camera does not see may be seen by other rows: wide lenses that move are evaluated up to this multiple
+/// of their angle.
 const BEYOND_MOVED: f64 = 1.1;
 /// Positions along each side of an image at which its largest radius or angle is searched.
 const SAMPLES: u32 = 16;
@@ -70,7 +71,7 @@ impl LensParams {
         self.lens.is_wide()
     }
 
-    /// Pixel coordinates of `x`, in the camera, and its depth; `None` where it is not evaluated.
+    /// Pixel coordinates and depth of `x`, a position in the camera; `None` if the lens does not show it.
     pub(crate) fn project(&self, x: [f64; 3], focal: [f64; 2], principal: [f64; 2]) -> Option<([f64; 2], f64)> {
         let at = self.lanes(Double).at(x, focal, principal);
         at.shown.then_some((at.xy, at.depth))
@@ -91,7 +92,7 @@ impl LensParams {
                 s: unroll!(i in 2 => simd.splat(s[i])),
             },
             Lens::Fov { omega } => {
-                // A pinhole has none: the ratio of both is 1 then.
+                // At 0 the model is a pinhole; the bound keeps `scale / omega` at 1 there.
                 let omega = omega.max(1e-6);
                 Bend::Fov {
                     scale: simd.splat(2.0 * (0.5 * omega).tan()),
@@ -150,27 +151,27 @@ enum Bend<F> {
     Fov { scale: F, omega: F },
 }
 
-/// What a lens does around a position in the camera.
+/// The values and derivatives of a lens at a position in the camera.
 pub(super) struct LensAt<F: Lanes> {
     /// Pixel coordinates.
     pub xy: [F; 2],
     /// See [`Intrinsics::depth`].
     pub depth: F,
-    /// Of the pixel coordinates.
+    /// The Jacobian of the pixel coordinates.
     pub jacobian: [[F; 3]; 2],
     /// Whether the lens shows it.
     pub shown: F::Mask,
-    /// Of the pixel coordinates: the derivatives of `jacobian`.
+    /// Second derivatives of the pixel coordinates: the derivatives of `jacobian`.
     second: [[F; 6]; 2],
     depth_gradient: [F; 3],
     limited: Option<Limited<F>>,
 }
 
-/// How a position beyond a perspective lens's limit is brought to it: along the radius, at the same depth.
+/// How a position beyond a perspective lens's limit is moved to the limit: along the radius, at the same depth.
 struct Limited<F: Lanes> {
     /// Where the limit is exceeded.
     beyond: F::Mask,
-    /// The position less that at which the lens is evaluated; zero within the limit.
+    /// The position minus that at which the lens is evaluated; zero within the limit.
     rest: [F; 2],
     /// Unit vector away from the axis.
     outwards: [F; 2],
@@ -283,7 +284,7 @@ impl<F: Lanes> LensLanes<F> {
                 tangential(plane, r2, above * below.recip(), *p)
             }
             Bend::Fisheye { k, p, s } => {
-                // theta / sin(theta) = 2 atan(t) / (t (d + z)) of the half angle's tangent t = rho / (d + z), which is smooth on the axis.
+                // theta / rho = 2 atan(t) / (t (d + z)) with the half angle's tangent t = rho / (d + z), which is smooth on the axis.
                 let rho2 = x * x + y * y;
                 let inverse = ((rho2 + z * z).sqrt() + z).recip();
                 let factor = (rho2 * inverse * inverse).arctangent_ratio() * inverse.scale(two);
@@ -404,7 +405,7 @@ impl<F: Lanes> Jet<F> {
         }
     }
 
-    /// A function of this one, of which the value and the derivatives are given.
+    /// A function of this jet, given the function's value and its first two derivatives.
     #[inline(always)]
     fn chain(self, value: F, first: F, second: F) -> Self {
         let own = &self.first;
@@ -446,7 +447,7 @@ impl<F: Lanes> Jet<F> {
     }
 }
 
-/// `h = atan(sqrt(w)) / sqrt(w)` and its two first derivatives. From `2 w h' + h = 1 / (1 + w)`, or near 0 by the series
+/// `h = atan(sqrt(w)) / sqrt(w)` and its first two derivatives, from `2 w h' + h = 1 / (1 + w)`, or near 0 from the series
 /// `1 - w / 3 + w^2 / 5 - ..`.
 fn arctangent_ratio(w: f64) -> [f64; 3] {
     if w < 0.02 {

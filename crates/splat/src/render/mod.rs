@@ -47,7 +47,7 @@ pub struct RenderOptions {
     pub antialias: bool,
     /// Fill [`Renderer::depth`].
     pub depth: bool,
-    /// Splats to draw: the first ones, rounded up to a multiple of [`CHUNK`].
+    /// Number of splats to draw, counted from the first and rounded up to a multiple of [`CHUNK`].
     pub first: usize,
 }
 
@@ -600,7 +600,7 @@ impl Renderer {
     }
 }
 
-/// What other devices are compared with, stage by stage.
+/// Results of the stages, with which those of other devices are compared.
 #[cfg(all(test, feature = "gpu"))]
 impl Renderer {
     /// Splat `i` on screen, if it is visible: the words of `footprints` in the shaders.
@@ -637,7 +637,7 @@ impl Renderer {
     }
 }
 
-/// Parts of a frame's projection for each thread: more balance better, and cost a count for every tile.
+/// Parts of a frame's projection per thread: more parts balance the load better, but each costs a counter for every tile.
 const PARTS_PER_THREAD: usize = 4;
 
 fn corner(bins: &Bins, tile: usize) -> [f32; 2] {

@@ -3,7 +3,8 @@
 //!
 //! Symbols: `m` mean in the world, `x = R m + t` in the camera, `q` unit quaternion, `s` standard deviations,
 //! `J` Jacobian of the projection, `U = J R Rot(q)` (2x3), `V = U diag(s)`, `cov = V V^T + dilation`,
-//! `conic = cov^-1 = [A B; B C]`. J is that of a pinhole, or of a lens ([`super::lens`]). All functions are generic over lanes: `f32` vectors train, `f64` is tested.
+//! `conic = cov^-1 = [A B; B C]`. J is that of a pinhole, or of a lens ([`super::lens`]). All functions are generic over lanes:
+//! vectors of `f32` in training, `f64` in tests.
 
 use super::lens::LensAt;
 use super::view::ViewLanes;
@@ -13,7 +14,7 @@ use std::f64::consts::{LN_2, LOG2_E};
 
 /// Pixels squared added to the diagonal of the 2D covariance (Inria code, "low-pass filter").
 pub const DILATION: f64 = 0.3;
-/// A fragment is drawn from this alpha on (Inria code).
+/// Minimum alpha for a fragment to be drawn (Inria code).
 pub const ALPHA_MIN: f64 = 1.0 / 255.0;
 /// Floor of the ratio under the root of the antialiasing compensation: 0.005 squared (gsplat).
 const COMPENSATION_FLOOR: f64 = 0.005 * 0.005;
@@ -72,7 +73,7 @@ struct Intermediate<F: Lanes> {
     scale: [F; 3],
     /// Variance along each axis before the 3D filter divided by that after it.
     fraction: [F; 3],
-    /// What a lens shows at the mean; `None` for a pinhole.
+    /// The lens at the mean; `None` for a pinhole.
     lens: Option<LensAt<F>>,
     /// Rows of J R.
     jr: [[F; 3]; 2],
@@ -393,7 +394,7 @@ fn pinhole_vjp<F: Lanes>(
         let tangent = at.x[r] * at.inv_z;
         let [least, largest] = view.limits[r];
         let v_tangent = v_tangent.masked(least.lt(tangent).and(tangent.lt(largest)));
-        // The pixel position moves with the tangent, too, unclamped.
+        // The pixel position also depends on the tangent, unclamped.
         let v_free = v_tangent + v_out.xy[r] * view.f[r];
         v_x[r] += v_free * at.inv_z;
         v_x[2] -= v_free * tangent * at.inv_z;

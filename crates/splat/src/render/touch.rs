@@ -13,7 +13,7 @@ const SLACK: f32 = 1e-2;
 const WIDTH: f32 = BLOCK_WIDTH as f32;
 /// Bands in a tile.
 const BANDS: usize = TILE / BLOCK_WIDTH;
-/// Splats that touch more bands are not worth a whole vector.
+/// Spans of splats that touch more bands are not worth computing for a whole vector.
 const MAX_BANDS: usize = 12;
 
 /// First and last block from the image's top within a band; first > last if there is none.
@@ -24,11 +24,11 @@ const NO_SPAN: Span = (u32::MAX, 0);
 pub(super) struct Spans {
     /// First and last band of each splat; first > last if it touches none.
     bands: [[f32; 16]; 2],
-    /// First and last block, by band from the first and lane; of splats of at most [`MAX_BANDS`] bands.
+    /// First and last block, by band (counted from the splat's first) and lane, of splats that touch at most [`MAX_BANDS`] bands.
     blocks: [[[f32; 16]; 2]; MAX_BANDS],
 }
 
-/// A splat's footprint as far as it matters here, one splat per lane.
+/// The part of a splat's footprint that is needed here, one splat per lane.
 #[derive(Clone, Copy)]
 pub(super) struct Outline<F> {
     pub xy: [F; 2],
@@ -38,7 +38,7 @@ pub(super) struct Outline<F> {
 }
 
 impl Spans {
-    /// Of the splats `shown` on an image of `tiles_x` by `tiles_y` tiles.
+    /// The spans of the splats `shown` on an image of `tiles_x` by `tiles_y` tiles.
     #[inline(always)]
     pub fn new<F: Lanes<Scalar = f32>>(s: &Outline<F>, shown: F::Mask, tiles_x: usize, tiles_y: usize) -> Self {
         let constant = |value: f32| s.log2_opacity.simd().set(value);
@@ -118,7 +118,7 @@ fn ceil<F: Lanes>(v: F) -> F {
     -(-v).floor()
 }
 
-/// The spans of one splat of many bands.
+/// The spans of one splat that touches many bands.
 #[inline(always)]
 fn wide_spans(s: &Footprint2d, tiles_y: usize) -> impl Fn(usize) -> Span {
     let [x, y] = s.xy;
@@ -150,7 +150,7 @@ fn wide_spans(s: &Footprint2d, tiles_y: usize) -> impl Fn(usize) -> Span {
     }
 }
 
-/// From the spans of the bands `first..=last` to tiles and blocks.
+/// Converts the spans of the bands `first_band..=last_band` to tiles and blocks.
 #[inline(always)]
 fn tiles_of(
     [first_band, last_band]: [usize; 2],

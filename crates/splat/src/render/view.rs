@@ -21,7 +21,7 @@ pub struct ViewParams {
     pub height: u32,
     /// Near plane, world units.
     pub near: f64,
-    /// What bends the rays, or moves while they are exposed; `None` for a pinhole at rest.
+    /// Lens, and motion during the exposure; `None` for a pinhole at rest.
     pub lens: Option<LensParams>,
 }
 

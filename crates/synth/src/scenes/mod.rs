@@ -30,13 +30,13 @@ pub enum SceneName {
     Thin,
 }
 
-/// There is no scene of this name.
+/// An unknown name of a scene.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("no scene is called `{0}`; there are demo, room, shelf, outdoor, thin")]
+#[error("unknown scene `{0}`; use demo, room, shelf, outdoor or thin")]
 pub struct UnknownScene(String);
 
 impl SceneName {
-    /// All of them.
+    /// All scenes.
     pub const ALL: [SceneName; 5] = [
         SceneName::Demo,
         SceneName::Room,
@@ -79,7 +79,7 @@ impl FromStr for SceneName {
     }
 }
 
-/// Random stream of the layout, apart from those of cameras and points.
+/// Random stream of the layout, separate from those of cameras and points.
 const LAYOUT: u64 = 500;
 
 fn matte(shape: Shape, texture: Texture) -> Object {
@@ -111,7 +111,7 @@ fn any_tint(rng: &mut Rng) -> Vec3 {
     tint(rng.uniform(), rng.range(0.35, 0.9), rng.range(0.12, 0.65))
 }
 
-/// A random pattern of two colours: patches, a checker or stripes, of features of about `size`.
+/// A random pattern of two colours: patches, a checker or stripes, with features of about `size`.
 fn pattern(rng: &mut Rng, size: f32) -> Texture {
     let colors = [any_tint(rng), any_tint(rng) * 0.8 + 0.15];
     match rng.below(3) {

@@ -1,4 +1,4 @@
-//! A furnished room with plain walls: a bed, a table with chairs, a bookcase, a picture and a window.
+//! A furnished room with plain walls: a bed, a bookcase, a table, a lamp, a picture and a window.
 
 use super::{any_tint, block, matte, pattern, tint};
 use crate::cameras::{Path, Rig};
@@ -41,7 +41,7 @@ pub fn build(rng: &mut Rng) -> (SynthScene, Rig) {
     (scene, Rig { path, fov_x: 1.15 })
 }
 
-/// Along the wall at -X.
+/// A bed along the wall at -X.
 fn bed(rng: &mut Rng, half: Vec2) -> Vec<Object> {
     let y = rng.range(-0.5, 0.5);
     let at = |x: f32, z: f32| Vec3::new(-half.x + x, y, z);
@@ -72,7 +72,7 @@ fn bed(rng: &mut Rng, half: Vec2) -> Vec<Object> {
     parts
 }
 
-/// Along the wall at +X: boards and rows of books.
+/// A bookcase along the wall at +X: boards and rows of books.
 fn bookcase(rng: &mut Rng, half: Vec2) -> Vec<Object> {
     let (x, y) = (half.x - 0.16, rng.range(-0.6, 0.6));
     let wood = Texture::Wood(Vec3::new(0.26, 0.15, 0.08));
@@ -100,7 +100,7 @@ fn bookcase(rng: &mut Rng, half: Vec2) -> Vec<Object> {
     parts
 }
 
-/// A low table in the middle, on a rug, with things on it.
+/// A low table in the middle, on a rug, with objects on it.
 fn table(rng: &mut Rng) -> Vec<Object> {
     let center = Vec3::new(rng.range(-0.3, 0.3), rng.range(-0.3, 0.3), 0.0);
     let turn = rng.range(-0.5, 0.5);

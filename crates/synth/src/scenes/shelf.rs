@@ -1,4 +1,4 @@
-//! A shelf with objects before a plain wall, captured from the front.
+//! A shelf with objects in front of a plain wall, captured from the front.
 
 use super::{any_tint, block, matte, pattern, tint};
 use crate::cameras::{Path, Rig};
@@ -23,7 +23,7 @@ const SIZE: Vec3 = Vec3::new(1.25, 0.19, 1.9);
 pub fn build(rng: &mut Rng) -> (SynthScene, Rig) {
     let wall = tint(rng.uniform(), rng.range(0.05, 0.2), rng.range(0.5, 0.7));
     let floor = Vec3::new(0.40, 0.26, 0.15) * rng.range(0.6, 1.2);
-    // Everything surrounds the shelf, the cameras too; the wall behind it is part of a cluster that casts no shadow on it.
+    // The room surrounds the shelf and the cameras; the wall behind the shelf is a cluster, which casts no shadow on the shelf.
     let room = Shape::Interior {
         half: Vec2::new(6.0, 6.0),
         height: 3.2,
@@ -81,7 +81,7 @@ fn boards(rng: &mut Rng, columns: u32, rows: u32) -> Vec<Object> {
     parts
 }
 
-/// What stands in the compartment whose lower left corner and size are given.
+/// The objects in the compartment with the given lower left corner and size.
 fn objects(rng: &mut Rng, corner: Vec3, size: Vec2) -> Vec<Object> {
     let mut parts = Vec::new();
     let mut along = 0.02;

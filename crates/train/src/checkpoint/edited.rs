@@ -32,7 +32,7 @@ pub fn splats_of(bytes: &[u8]) -> Result<Splats, TrainError> {
 /// When the bytes are not a checkpoint of this program.
 ///
 /// # Panics
-/// When there is not a source for every splat, or the splats have other bands than those of the checkpoint.
+/// If there is not a source for every splat, or the splats' SH bands are not those of the checkpoint.
 pub fn with_splats(bytes: &[u8], splats: &Splats, sources: &[Option<u32>]) -> Result<Vec<u8>, TrainError> {
     let before = splats_of(bytes)?;
     assert_eq!(splats.len(), sources.len(), "a source for every splat");

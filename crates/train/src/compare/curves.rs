@@ -68,8 +68,8 @@ pub fn reached(evaluations: &[EvaluationPoint], psnr: f64, axis: fn(&EvaluationP
 }
 
 /// The fraction of blocks of steps in which the training loss rises: the logged losses in order, in blocks of 25 (of fewer if
-/// there are under 250, but at least 5), the mean of each compared with the previous one. Single steps see different views and
-/// rise half of the time in any case. `None` with fewer than two blocks.
+/// there are under 250, but at least 5), the mean of each compared with the previous one. Single steps show different views, and their
+/// losses rise half of the time in any case. `None` with fewer than two blocks.
 pub fn rises(losses: &[f64]) -> Option<f64> {
     let losses: Vec<f64> = losses.iter().copied().filter(|loss| loss.is_finite()).collect();
     let block = (losses.len() / 10).clamp(5, BLOCK);

@@ -34,7 +34,7 @@ pub struct Comparison {
     pub overall: Vec<Overall>,
     /// Published figures of the scenes, if the comparison follows their protocol.
     pub published: Vec<Published>,
-    /// What limits the figures, one line each.
+    /// Limitations of the figures, one line each.
     pub notes: Vec<String>,
 }
 
@@ -249,7 +249,7 @@ impl Comparison {
     }
 }
 
-/// A note for each recipe that was trained on the distance by which it is scored.
+/// A note for each recipe that was trained on the perceptual distance by which it is scored.
 pub fn flattered(scenes: &[Scene]) -> Vec<String> {
     let line = |(recipe, figures): (&str, &Figures)| {
         let net = figures.trained_on_lpips.as_deref()?;

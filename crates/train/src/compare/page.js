@@ -118,7 +118,7 @@
       return row([colored(entry.recipe, i), ...cells, known(entry.mark_share) ? `${fixed(100 * entry.mark_share, 0)} %` : "–",
         `${seconds ? seconds.runs : 0} of ${finished}`]);
     });
-    return table(["Recipe", "Seconds", "Steps", "Of the first one's whole time", "Runs that do"], lines, { class: "dense" });
+    return table(["Recipe", "Seconds", "Steps", "Fraction of the first one's whole time", "Runs that reach it"], lines, { class: "dense" });
   };
 
   const pictures = (scene) => {
@@ -191,7 +191,7 @@
         curves(scene.entries, "step", "Held-out PSNR over steps"));
       part("Curves", both);
       if (scene.mark) {
-        part(`Until a recipe reaches what ${scene.entries[0].recipe} ends with: ${fixed(scene.mark.psnr, 2)} dB, ` +
+        part(`Time until a recipe reaches the final PSNR of ${scene.entries[0].recipe}: ${fixed(scene.mark.psnr, 2)} dB, ` +
           `after ${fixed(scene.mark.seconds, 1)} s`, scrolled(toMark(scene.entries)));
       }
       part("Seconds of training until a held-out PSNR (dB) is reached", scrolled(times(scene.entries, "seconds", (x) => fixed(x, 1))));

@@ -1,4 +1,4 @@
-//! Published figures (`published.toml`), to be set beside those of a comparison that follows the same protocol.
+//! Published figures (`published.toml`), shown next to those of a comparison that follows the same protocol.
 
 use super::{Comparison, Spread};
 use crate::report::columns;
@@ -112,7 +112,7 @@ pub(super) fn to_text(comparison: &Comparison) -> String {
     let Some(lines) = lines(comparison) else {
         return String::new();
     };
-    let mut text = format!("\nBeside published figures:\n{}", columns(&lines, 2));
+    let mut text = format!("\nCompared with published figures:\n{}", columns(&lines, 2));
     for source in sources(comparison) {
         text += &format!("{source}\n");
     }

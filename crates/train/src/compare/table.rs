@@ -36,7 +36,7 @@ pub fn to_text(comparison: &Comparison) -> String {
     text
 }
 
-/// What [`marks`] shows.
+/// Title of the table of [`marks`].
 const MARKS: &str = "Seconds of training until a recipe reaches the first one's final PSNR; in brackets, divided by the seconds of \
                      the first one's whole run";
 
@@ -80,7 +80,7 @@ pub fn to_markdown(comparison: &Comparison) -> String {
              short runs) whose mean training loss is above that of the previous block; *error rises*: the same for the mean \
              squared error of the training views, which is comparable between recipes.\n";
     if let Some(lines) = published::lines(comparison) {
-        text += &format!("\nBeside published figures:\n\n{}\n", markdown(&lines, 2));
+        text += &format!("\nCompared with published figures:\n\n{}\n", markdown(&lines, 2));
         for source in published::sources(comparison) {
             text += &format!("- {}\n", escaped(&source));
         }

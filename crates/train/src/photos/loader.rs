@@ -1,4 +1,4 @@
-//! Loads photographs on threads of its own, so that a step does not wait while the disk and the decoder keep up.
+//! Loads photographs on threads of its own, so that a step does not wait as long as the disk and the decoder keep up.
 
 use super::Prepared;
 use irradia_scene::{Dataset, LoadError, Photo};
@@ -99,7 +99,7 @@ impl Loader {
         Self(shared)
     }
 
-    /// Replaces the queue; views in `running` of [`Self::take`] are not queued again.
+    /// Replaces the queue; photographs that are being loaded or wait to be taken are not queued again.
     pub fn queue(&self, jobs: Vec<Job>) {
         let mut state = self.0.lock();
         let State {
@@ -113,7 +113,7 @@ impl Loader {
         self.0.queued.notify_all();
     }
 
-    /// What was loaded since the last call; waits for something if `wait`.
+    /// The photographs loaded since the last call; waits for at least one if `wait`.
     pub fn take(&self, wait: bool) -> Vec<Loaded> {
         let mut state = self.0.lock();
         while wait && state.done.is_empty() {
@@ -160,7 +160,7 @@ fn load(dataset: &Dataset, job: &Job, background: [f32; 3]) -> Result<(Arc<Prepa
     let photo = source.load()?;
     if (photo.width, photo.height) != (k.width, k.height) {
         return Err(LoadError(format!(
-            "{}: the photograph has {}x{} pixels where its camera has {}x{}: was the file replaced while training?",
+            "{}: the photograph has {}x{} pixels, but its camera has {}x{}: was the file replaced while training?",
             view.name, photo.width, photo.height, k.width, k.height
         )));
     }

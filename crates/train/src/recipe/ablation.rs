@@ -54,7 +54,7 @@ impl Ingredients {
             remove(recipe, |param| param.row().group == Group::Data);
         }
         if !self.loss_schedule {
-            // A parameter that the last stage does not set holds from the last stage that does.
+            // The values of a parameter are those of the last stage that sets it.
             for param in Param::ALL.into_iter().filter(|param| param.is_of_loss()) {
                 let last = recipe
                     .stage

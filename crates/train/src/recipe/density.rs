@@ -43,7 +43,7 @@ impl DensityControl {
         }
     }
 
-    /// Whether its statistics are gathered from the stage before, like those of the 3DGS code, which begin with the run and not with
+    /// Whether its statistics are gathered in the stage before as well, like those of the 3DGS code, which begin with the run and not with
     /// `densify_from_iter`.
     pub fn gathers_early(&self) -> bool {
         match self {
@@ -221,7 +221,7 @@ documented! {
         pub error_threshold: f32,
         /// Half size on screen, pixels, from which a splat is worth splitting.
         pub min_extent: f32,
-        /// Splats per pixel of a training image down to which none are removed, at most as many as at first.
+        /// Number of splats per pixel of a training image below which none are removed; at most the number of first splats.
         #[serde(default)]
         pub floor: f32,
     }

@@ -31,7 +31,8 @@ documented! {
         /// The network that outputs colour: `encoding`, `width`, `depth`, `skip`, `geometry`, `activation`, `density_bias`, `color`;
         /// see `NetShape` of the crate `irradia-field`.
         pub net: NetShape,
-        /// How samples are placed along a ray: `kind` is `occupancy`, `hierarchy` or `proposal`; see `Sampler` of the crate `irradia-field`.
+        /// How samples are placed along a ray: `kind` is `occupancy`, `hierarchy` or `proposal`; see `Sampler` of the crate
+        /// `irradia-field`.
         pub sampler: Sampler,
     }
 }
@@ -52,7 +53,7 @@ documented! {
 }
 
 impl ResidualKnobs {
-    /// `name` is that of the table, which has `images` photographs with appearance codes if any.
+    /// `name` is that of the table, `images` the number of photographs with appearance codes, 0 for none.
     pub(super) fn validate(&self, name: &str, images: usize) -> Result<(), String> {
         if !(0.0..1.0).contains(&self.beta2) {
             return Err(format!("{name}.beta2 must be between 0 and 1"));

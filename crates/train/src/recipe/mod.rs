@@ -79,32 +79,34 @@ documented! {
         #[serde(default, skip_serializing_if = "Option::is_none")]
         pub splats_per_pixel: Option<f32>,
         /// Radius around each training camera within which splats are removed at every round of density control, as a fraction of
-        /// the depth of the nearest points that its view sees (or of its depth bounds); 0 for none. If it is above 0 and photographs are at least 8
-        /// degrees apart, splats that only one of them sees, among other cameras and away from points, are moved far away.
+        /// the depth of the nearest points that its view sees (or of its depth bounds); 0 for none. If it is above 0 and photographs are at
+        /// least 8 degrees apart, splats that only one of them sees, among other cameras and away from points, are moved far away.
         #[serde(default, skip_serializing_if = "is_default")]
         pub free_space: f32,
-        /// The extent to which `rate_means` is relative, in pixels of the training images at the distance of each splat from the camera of the step;
-        /// 0: the largest distance of a camera from their mean, as in 3DGS, which says little about how large the scene is in the images.
+        /// The length to which `rate_means` is relative, in pixels of the training images at the distance of each splat from the camera of
+        /// the step; 0: the largest distance of a camera from their mean, as in 3DGS, which says little about how large the scene is in the
+        /// images.
         #[serde(default, skip_serializing_if = "is_default")]
         pub extent_pixels: f32,
         /// Exponent of the rates' dependence on the length of a run that is longer than the recipe: with 0.5 a run of four times the
         /// recipe's steps has half the rates; 0 for none.
         #[serde(default, skip_serializing_if = "is_default")]
         pub length_exponent: f32,
-        /// Steps for each training photograph that a run without a number of steps or a budget has at least, up to ten times the recipe's own
-        /// length; 0: it always has its own length.
+        /// Minimum number of steps per training photograph in a run without a number of steps or a budget, up to ten times the recipe's own
+        /// length; 0: such a run always has the recipe's own length.
         #[serde(default, skip_serializing_if = "is_default")]
         pub visits: u64,
-        /// Steps for each training photograph that a run without a number of steps has at most, if adjacent photographs are 8 degrees apart or more, as
-        /// seen from what they show, but at least a fifth of the recipe's own length. Where they are closer, a run with a budget has more in inverse proportion, and
-        /// at least the recipe's own length. A budget that allows more is not used up. 0: no limit.
+        /// Maximum number of steps per training photograph in a run without a number of steps, if adjacent photographs are 8 degrees apart
+        /// or more, as seen from what they show; the run has at least a fifth of the recipe's own length. If they are closer, the limit
+        /// applies to runs with a budget, grows in inverse proportion to the angle, and is at least the recipe's own length. A budget that
+        /// allows more is not used up. 0: no limit.
         #[serde(default, skip_serializing_if = "is_default")]
         pub sparse_visits: u64,
-        /// Changes, each as of `--set`, for runs that have neither a number of steps nor a budget: what pays only in runs of the recipe's length.
-        /// What is set otherwise takes precedence.
+        /// Assignments, each as for `--set`, for runs with neither a number of steps nor a budget: changes that pay only in runs of the
+        /// recipe's length. Other settings take precedence.
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
         pub unhurried: Vec<String>,
-        /// Steps between evaluations of the held-out views while training, of 32 where there are more; at least 1.
+        /// Steps between evaluations of the held-out views during training, of 32 of them if there are more; at least 1.
         pub eval_every: u64,
         /// Steps between checkpoints; at least 1.
         pub checkpoint_every: u64,
@@ -127,17 +129,17 @@ documented! {
         /// of the run, photographs differ in exposure beyond what adjacent cameras predict.
         #[serde(default, skip_serializing_if = "Choice::is_no")]
         pub exposure: Choice,
-        /// Train the vignette of each lens beside the splats, a polynomial of the distance from the principal point, the same in all of its photographs:
-        /// the scene has none, held-out views are compared with it.
+        /// Train the vignette of each lens, a polynomial in the distance from the principal point, the same in all of its photographs. The
+        /// scene does not contain it; held-out views are compared with it.
         #[serde(default, skip_serializing_if = "is_default")]
         pub vignette: bool,
-        /// Train a separate grid of affine colour maps for each photograph, by place and brightness: tone mapping.
+        /// Train a separate grid of affine colour maps for each photograph, by position and brightness: tone mapping.
         #[serde(default, skip_serializing_if = "is_default")]
         pub bilateral_grid: bool,
         /// Leave out photographs whose error, after a fifth of the run, is far beyond the others': wrong poses, or another scene.
         #[serde(default, skip_serializing_if = "is_default")]
         pub drop_misfits: bool,
-        /// Hide from training what stands in one photograph only, such as people who walk through, found after 0.3 of the run.
+        /// Hide from training what only one photograph shows, such as people who walk through; the first search is after 0.3 of the run.
         #[serde(default, skip_serializing_if = "is_default")]
         pub hide_transients: bool,
         /// Refine the cameras' poses.
@@ -146,23 +148,23 @@ documented! {
         /// A field that adds to the splats' colours.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         pub residual: Option<ResidualKnobs>,
-        /// A field of position that adds what the light of each photograph changes, by a code for each; it acts where `rate_codes` is above 0, and is left
-        /// out on a GPU.
+        /// A field of position, with a code for each photograph, that adds to the splats' colours what the light of the photograph changes;
+        /// active if `rate_codes` is above 0, and left out on a GPU.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         pub appearance: Option<ResidualKnobs>,
         /// Parameters over the whole run; a stage may override them.
         pub params: Params,
-        /// Parameters in place of those of `params` if the data show where space is empty: the dataset has points, or the photographs
-        /// have alpha, or masks that leave out all but an object. `--set` of the same parameter in `params` prevails.
+        /// Parameters that replace those of `params` if the data show where space is empty: the dataset has points, or the photographs have
+        /// alpha, or masks that leave out all but an object. `--set` of the same parameter in `params` takes precedence.
         #[serde(default, skip_serializing_if = "Params::is_empty")]
         pub known_space: Params,
         /// The same, if masks leave out all but an object.
         #[serde(default, skip_serializing_if = "Params::is_empty")]
         pub cut_out: Params,
-        /// The same, if the sky differs from photograph to photograph; `known_space` prevails.
+        /// The same, if the sky differs from photograph to photograph; `known_space` takes precedence.
         #[serde(default, skip_serializing_if = "Params::is_empty")]
         pub skies: Params,
-        /// The same, if at least 50 training photographs have more than 0.8 million pixels, in the mean; not of wide lenses.
+        /// The same, if there are at least 50 training photographs with a mean of more than 0.8 million pixels; not for wide lenses.
         #[serde(default, skip_serializing_if = "Params::is_empty")]
         pub large: Params,
         /// The stages, in order.
@@ -303,10 +305,10 @@ documented! {
         /// Parameters over this stage.
         #[serde(default)]
         pub params: Params,
-        /// How splats are added and removed; none are if absent.
+        /// How splats are added and removed; absent: they are not.
         #[serde(default)]
         pub density: Option<DensityControl>,
-        /// How adjacent splats are merged; none are if absent.
+        /// How adjacent splats are merged; absent: they are not.
         #[serde(default)]
         pub merge: Option<MergeKnobs>,
         /// When the stage may end before its steps are completed; never if absent.
@@ -434,10 +436,10 @@ impl Recipe {
             }
         };
         let (exposure, grid, poses) = (self.exposure != Choice::No, self.bilateral_grid, self.refine_poses);
-        // A photograph is used 30 to 100 times in a run, within which gains of 1.6 must be reached.
+        // A photograph is used 30 to 100 times in a run, in which gains of 1.6 must be reachable.
         default(exposure, Param::RateExposure, 0.03, 0.001);
         default(exposure, Param::ExposureReg, 0.01, 0.001);
-        // The curve is to be there before splats explain it.
+        // The vignette must be learned before splats explain it.
         default(self.vignette, Param::RateVignette, 0.01, 0.001);
         default(grid, Param::RateBilateral, 0.01, 0.0005);
         default(grid, Param::BilateralTv, 30.0, 30.0);
@@ -466,12 +468,12 @@ impl Recipe {
             .any(|knob| *knob != Knob::Const(0.0))
     }
 
-    /// The field of the light of photographs, if it acts.
+    /// The field for the light of photographs, if it is active.
     pub(crate) fn light(&self) -> Option<&ResidualKnobs> {
         self.appearance.as_ref().filter(|_| self.uses(Param::RateCodes))
     }
 
-    /// Takes `param` out of all stages: it has its default.
+    /// Removes `param` from the recipe and all stages, so that it has its default.
     pub fn unset(&mut self, param: Param) {
         let params = std::iter::once(&mut self.params).chain(self.stage.iter_mut().map(|stage| &mut stage.params));
         params.for_each(|params| drop(params.remove(&param)));
@@ -493,7 +495,7 @@ impl Recipe {
         }
         if !(epsilon.is_finite() && epsilon > 0.0) {
             return Err(format!(
-                "adam.epsilon = {epsilon} must be above 0: splats without a gradient would become no numbers"
+                "adam.epsilon = {epsilon} must be above 0: splats without a gradient would turn into NaN"
             ));
         }
         if self.stage.is_empty() {
@@ -584,7 +586,7 @@ fn is_default<T: Default + PartialEq>(value: &T) -> bool {
 }
 
 impl Recipe {
-    /// Whether what stage `i` trains can follow the stages before.
+    /// Checks that what stage `i` trains can follow the stage before it.
     fn validate_order(&self, i: usize) -> Result<(), String> {
         let stage = &self.stage[i];
         let before = i.checked_sub(1).map(|before| self.stage[before].represents);

@@ -125,7 +125,7 @@ pub enum Shape {
     Cosine,
 }
 
-/// The raw form of a knob in a file; serde's own message for an untagged enum would name nothing.
+/// The raw form of a knob in a file; serde's own message for an untagged enum would not say what is wrong.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct RawKnob {

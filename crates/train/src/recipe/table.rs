@@ -104,7 +104,8 @@ table! {
         curve: Some("count.allowed"),
         source: "Irradia",
     }
-    /// Fraction of the visible splats whose position and shape are trained, the largest first; opacity and colour of all are.
+    /// Fraction of the visible splats whose position and shape are trained, the largest first; opacity and colour of all splats are
+    /// trained.
     TrainedShare {
         name: "trained_share",
         unit: "fraction",
@@ -385,7 +386,7 @@ table! {
         curve: Some("loss.distortion"),
         source: "mip-NeRF 360 (Barron et al. 2022), eq. 15",
     }
-    /// Whether the residual field of a recipe that has one adds to the splats' colours, from then on for the rest of the run.
+    /// Whether the residual field of a recipe that has one adds to the splats' colours; once on, it stays on for the rest of the run.
     Residual {
         name: "residual",
         unit: "",
@@ -425,7 +426,7 @@ table! {
         curve: Some("rate.vignette"),
         source: "Irradia: 0.01 falling to 0.001 if a recipe with `vignette` does not set it",
     }
-    /// Learning rate of the colours of a sky behind the splats, which each photograph has its own of; without one there is no sky.
+    /// Learning rate of the colours of a sky behind the splats, a separate one for each photograph; 0: there is no sky.
     RateSky {
         name: "rate_sky",
         unit: "",
@@ -445,8 +446,8 @@ table! {
         curve: Some("rate.poses"),
         source: "Irradia: 1e-3 falling to 1e-5 if a recipe with `refine_poses` does not set it; BARF (Lin et al. 2021) uses 1e-3 to 1e-5",
     }
-    /// Weight of the mean 1 - alpha over unmasked pixels of photographs without alpha: all that they show is a surface. A regulariser: it
-    /// is no part of the reported loss.
+    /// Weight of the mean 1 - alpha over unmasked pixels of photographs without alpha: everything that they show is a surface. A
+    /// regulariser: it is not part of the reported loss.
     CoverWeight {
         name: "cover_weight",
         unit: "",
@@ -456,7 +457,8 @@ table! {
         curve: Some("loss.cover"),
         source: "Irradia",
     }
-    /// Weight of the mean alpha of pixels that masks leave out, over all pixels: nothing is there. For masks of all but an object.
+    /// Weight of the sum of alpha over the pixels that masks leave out, divided by the number of all pixels: nothing is there. For masks
+    /// that leave out all but an object.
     MaskWeight {
         name: "mask_weight",
         unit: "",
@@ -466,7 +468,7 @@ table! {
         curve: Some("loss.mask"),
         source: "Irradia",
     }
-    /// Weight of the mean |depth - depth of the map given beside the photograph|, relative to that depth; for splats.
+    /// Weight of the mean |depth - depth of the map given with the photograph|, relative to that depth; for splats.
     DepthMapWeight {
         name: "depth_map_weight",
         unit: "",
@@ -474,9 +476,9 @@ table! {
         bounds: NOT_NEGATIVE,
         group: Group::Loss,
         curve: Some("loss.depth map"),
-        source: "Hierarchical 3D Gaussians (Kerbl et al. 2024) with inverse depths; here depths, whatever the map has",
+        source: "Hierarchical 3D Gaussians (Kerbl et al. 2024) with inverse depths; here depths, whatever the map contains",
     }
-    /// Weight of the mean 1 - cosine between the normals of depth and those of the map given beside the photograph; for splats.
+    /// Weight of the mean 1 - cosine between the normals of the rendered depth and those of the map given with the photograph; for splats.
     NormalMapWeight {
         name: "normal_map_weight",
         unit: "",
@@ -484,7 +486,7 @@ table! {
         bounds: NOT_NEGATIVE,
         group: Group::Loss,
         curve: Some("loss.normal map"),
-        source: "DN-Splatter (Turkulainen et al. 2024) with the normals of splats; here those of depth",
+        source: "DN-Splatter (Turkulainen et al. 2024) with the normals of splats; here those of the rendered depth",
     }
     /// Learning rate of the photographs' grids of colour maps, if the recipe has `bilateral_grid`.
     RateBilateral {
@@ -526,7 +528,7 @@ mod tests {
             assert_eq!(same(|row| Some(row.name)), 1, "{}", row.name);
             assert!(
                 row.curve.is_none() || same(|row| row.curve) == 1,
-                "{}: two curves of one name",
+                "{}: two curves with one name",
                 row.name
             );
             assert!(row.bounds.contains(&row.default), "{}", row.name);

@@ -19,7 +19,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 pub struct Report {
     /// Version of the program.
     pub version: String,
-    /// The device, such as `CPU, 2 threads, avx512`, after the GPU that was asked for, if any.
+    /// The device, such as `CPU, 2 threads, avx512`, preceded by the requested GPU, if any.
     pub device: String,
     /// The dataset, as the user named it.
     pub dataset: String,
@@ -61,8 +61,8 @@ pub struct Report {
     /// Mean over the held-out views, dB; NaN, and absent from files, if none could be measured.
     #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
     pub psnr: f64,
-    /// Mean over the held-out views after the affine colour map of each that fits best, dB; NaN, and absent from files, if none
-    /// could be measured.
+    /// Mean over the held-out views, each after the affine colour map that fits it best, dB; NaN, and absent from files, if none could be
+    /// measured.
     #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
     pub psnr_corrected: f64,
     /// Mean over the held-out views; NaN, and absent from files, if none could be measured.
@@ -175,7 +175,7 @@ pub struct ViewReport {
     /// dB; NaN, and absent from files, if the view's mask excludes all pixels.
     #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
     pub psnr: f64,
-    /// The same after the affine colour map that fits best, dB.
+    /// PSNR after the affine colour map that fits best, dB; NaN likewise.
     #[serde(default = "nan", deserialize_with = "or_nan", skip_serializing_if = "is_nan")]
     pub psnr_corrected: f64,
     /// Structural similarity; NaN, and absent from files, if the view's mask excludes all pixels.

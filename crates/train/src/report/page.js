@@ -33,7 +33,7 @@
   }
   if (report.corner_brightness) {
     const corners = `corners of the photographs have ${fixed(report.corner_brightness, 2)} of the middle's brightness`;
-    notes.push(`${corners}: the scene is without this vignette, held-out views are shown and measured with it`);
+    notes.push(`${corners}: the scene does not contain this vignette; held-out views are shown and measured with it`);
   }
   if (notes.length) {
     at("warnings").hidden = false;
@@ -173,10 +173,10 @@
       at("schedule").append(chart(title, lines, { ...options, marks, legend: lines.length > 1, tell: brief }));
     }
     const source = schedule.done ? "As executed, over steps" :
-      "As planned, aligned with the steps of each stage: how early stages ended is not known for a run fitted into a time";
+      "As planned, aligned with the steps of each stage: for a run with a time budget it is not known how early stages ended";
     const names = report.stages.map((stage) => stage.name).join(", ");
     at("schedule-note").textContent =
-      `${source}; lines part the stages ${names}.${still.length ? ` Unchanged: ${still.join("; ")}.` : ""}`;
+      `${source}; vertical lines separate the stages ${names}.${still.length ? ` Unchanged: ${still.join("; ")}.` : ""}`;
   }
 
   // Machine, stages, recipe.

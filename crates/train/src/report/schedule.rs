@@ -10,9 +10,9 @@ use serde::{Deserialize, Serialize};
 /// Parameter curves over the steps of a run.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Schedule {
-    /// Whether this is what the run did. Otherwise it is the plan, aligned with the steps of each stage: for a run fitted into a
-    /// time whose stages may end early, the skipped time is unknown. Within a stage recipe time is assumed to be proportional to
-    /// steps, which is exact up to the drift of a budget's pace.
+    /// Whether this is what the run did. Otherwise it is the plan, aligned with the steps of each stage: for a run with a time budget whose
+    /// stages may end early, the skipped time is unknown. Within a stage recipe time is assumed to be proportional to steps, which is exact
+    /// up to the drift of a budget's pace.
     pub done: bool,
     /// Steps completed.
     pub steps: Vec<f32>,
@@ -33,7 +33,7 @@ pub struct KnobCurve {
 const SAMPLES: f64 = 160.0;
 
 /// The schedule of a run of `recipe` at `clock` with the stages `stages`. `steps` is the number of steps into which it was
-/// fitted, `timed` whether it was fitted into a time instead.
+/// fitted, `timed` whether it was fitted into a time budget instead.
 pub fn schedule(recipe: &Recipe, stages: &[StageReport], clock: &Clock, steps: Option<u64>, timed: bool) -> Schedule {
     let spans = spans(recipe, stages, clock, steps, timed);
     let mut run = Clock::new(recipe);
@@ -228,7 +228,7 @@ mod tests {
 
     #[test]
     fn a_stage_ended_early_shows_what_was_done() {
-        // As the clock advances if the first stage ends after 40 steps.
+        // The clock of a run whose first stage ends after 40 steps.
         let recipe = recipe("stage.warmup.exit={ when = 'threshold', tau = 0.1 }");
         let mut clock = Clock::new(&recipe);
         let mut truth = Vec::new();

@@ -52,7 +52,7 @@ const slider = (frame) => {
   slide(50);
 };
 
-// Distinct in hue and in lightness; from the ninth on lighter.
+// Distinct in hue and lightness; lighter from the ninth on.
 const HUES = [18, 198, 75, 275, 145, 330, 235, 45];
 const color = (i) => `hsl(${HUES[i % HUES.length]} 62% ${i < HUES.length ? 46 : 66}%)`;
 

@@ -79,7 +79,7 @@ pub struct StepPlan {
     pub measure: bool,
     /// Evaluate held-out views after the step.
     pub evaluate: bool,
-    /// A checkpoint is written, after the step.
+    /// Write a checkpoint after the step.
     pub checkpoint: bool,
 }
 
@@ -88,7 +88,7 @@ pub struct StepPlan {
 pub struct Round {
     /// The strategy.
     pub density: DensityControl,
-    /// Whether oversized splats go too.
+    /// Whether oversized splats are removed too.
     pub prune_large: bool,
     /// Which round of the stage it is, from 1.
     pub number: u64,
@@ -271,7 +271,7 @@ pub fn is_due(clock: &Clock, every: u64) -> bool {
 pub fn plan(recipe: &Recipe, clock: &Clock) -> StepPlan {
     let values = values(recipe, clock);
     let stage = &recipe.stage[clock.stage.min(recipe.stage.len() - 1)];
-    // Counted from 1: the step after whose completion the stage has n steps.
+    // Counted from 1: the number of steps of the stage once this one is complete.
     let in_stage = clock.step + 1 - clock.stage_step;
     let density = stage.density;
     let next = recipe.stage.get(clock.stage + 1).and_then(|stage| stage.density);

@@ -1,6 +1,6 @@
-//! At colour: what the light of each photograph adds to the splats' colours, by position. A small field, whose network takes the photograph's
-//! appearance code (NeRF-W, Martin-Brualla et al. 2021; for splats WildGaussians, Kulhanek et al. 2024), less what it outputs for the mean code: in
-//! the mean light, which held-out views and exported scenes have, it adds nothing.
+//! At colour: what the light of each photograph adds to the splats' colours, by position. This is the output of a small field, whose
+//! network takes the photograph's appearance code (NeRF-W, Martin-Brualla et al. 2021; for splats WildGaussians, Kulhanek et al. 2024),
+//! minus its output for the mean code: in the mean light, which held-out views and exported scenes have, it adds nothing.
 
 use super::color_field::{self, ColorField};
 use crate::recipe::{Param, ResidualKnobs};
@@ -22,7 +22,7 @@ pub(crate) fn lit_colors(field: &Field, view: usize, center: Vec3, surfaces: &[S
 #[derive(Clone)]
 pub struct Appearance(pub(super) ColorField);
 
-/// What is added in the light of `view`.
+/// The terms that are added in the light of `view`.
 fn terms(view: usize) -> [(Option<u32>, f32); 2] {
     [(Some(view as u32), 1.0), (None, -1.0)]
 }

@@ -1,12 +1,11 @@
 //! After blending, after the exposure: a bilateral grid of affine colour maps per photograph.
 //!
 //! Phones change colours locally (tone mapping, local contrast, vignetting), which one map per photograph cannot follow. Here a
-//! photograph has a map `y = A x + b` for each place in the picture and each brightness there: a coarse grid over both, interpolated
-//! linearly (Wang et al., "Bilateral Guided Radiance Field Processing", 2024). The brightness is that of
-//! the rendered colour, so that the gradient of a colour also passes through the choice of its map. Photographs saturate at 1, and so
-//! does `y`.
+//! photograph has a map `y = A x + b` for each position in the image and each brightness there: a coarse grid over both, interpolated
+//! linearly (Wang et al., "Bilateral Guided Radiance Field Processing", 2024). The brightness is that of the rendered colour, so that the
+//! gradient of a colour also passes through the choice of its map. Photographs saturate at 1, and so does `y`.
 //!
-//! `t` is a position in the grid, in cells from its first one; `w` a weight of the cell after it, and 1 - w that of the cell before.
+//! `t` is a position in the grid, in cells from its first one; `w` is the weight of the cell after it, and 1 - w that of the cell before.
 
 use super::{Occupant, pieces};
 use crate::tensor_file::{NamedTensor, TensorSource, to_bytes};
@@ -15,10 +14,11 @@ use irradia_compute::simd::{Kernel, Lanes, Simd};
 use irradia_compute::{Level, Planes};
 use rayon::prelude::*;
 
-/// Cells down and across the picture, and along the brightness; in this order they are in memory.
+/// Numbers of cells down and across the image, and along the brightness; they are in memory in this order.
 ///
-/// Wang et al. have 16 x 16 x 8, for tens of thousands of steps. Here a photograph is used 30 to 100 times in a run, which determines no more
-/// than this: on fox with made-up gains, 16 x 16 x 8 ends 1.8 dB lower at their weight of the variation; and it takes eight times the memory.
+/// Wang et al. use 16 x 16 x 8, for tens of thousands of steps. Here a photograph is used 30 to 100 times in a run, which does not
+/// determine more cells than this: on fox with synthetic gains, 16 x 16 x 8 ends 1.8 dB lower with their weight of the variation, and takes
+/// eight times the memory.
 const SIZE: [usize; 3] = [8, 8, 4];
 const CELLS: usize = SIZE[0] * SIZE[1] * SIZE[2];
 /// Cells of a row of the grid.
@@ -34,15 +34,15 @@ const ROWS: usize = 8;
 const BETAS: [f32; 2] = [0.9, 0.999];
 const EPSILON: f32 = 1e-15;
 
-/// A cell as it is used: what red, green, blue and 1 are multiplied by, each for three channels and a lane of padding.
+/// A cell in the layout in which it is applied: the factors of red, green, blue and 1, each for three channels and a lane of padding.
 type Map = [f32; LANES];
 const LANES: usize = 16;
 const NOTHING: Map = [0.0; LANES];
 
 /// A grid of colour maps per view, initially the identity. As with exposures, the mean over the training views of each cell stays
-/// the identity: a change common to all photographs belongs to the scene, which would otherwise drift to a look of no photograph. What
-/// all photographs have at the same place in the picture, such as a lens's vignette, therefore stays in the scene as well: views
-/// without a grid, held-out ones, show it.
+/// the identity: a change common to all photographs belongs to the scene, which would otherwise drift to a look that no photograph has.
+/// What all photographs have at the same position in the image, such as a lens's vignette, therefore stays in the scene as well: held-out
+/// views, which have no grid, show it.
 ///
 /// A view's grid is the identity, plus its own cells, minus the mean of all views' own cells; the mean follows each step, so that a
 /// step touches two grids rather than all.
@@ -61,7 +61,7 @@ pub struct BilateralGrid {
 struct Learnt {
     /// One plane, `[CELLS][N]`.
     own: Planes,
-    /// First and second moments, the same.
+    /// First and second moments, of the same shape.
     moments: [Planes; 2],
     /// Number of steps.
     steps: u64,
@@ -101,7 +101,7 @@ impl BilateralGrid {
         grid
     }
 
-    /// `color` `[3, H, W]`, of `width` columns, as in the photograph of `view`, at most 1.
+    /// Applies the grid of `view` to `color` `[3, H, W]`, of `width` columns; results are at most 1.
     pub fn develop(&self, view: usize, width: usize, color: &[f32], to: &mut Vec<f32>) {
         let grid = self.grid(view);
         to.resize(color.len(), 0.0);
@@ -152,7 +152,7 @@ impl BilateralGrid {
     }
 }
 
-/// Where a [`Map`] has parameter `i` of a cell.
+/// The lane of a [`Map`] that has parameter `i` of a cell.
 #[inline(always)]
 fn lane(i: usize) -> usize {
     if i < 9 { 4 * (i % 3) + i / 3 } else { 3 + i }
@@ -190,7 +190,7 @@ struct Slice {
     w_column: f32,
     /// Weight of the brighter cells.
     w_bright: f32,
-    /// The gradient of `w_bright` for the brightness.
+    /// The derivative of `w_bright` with respect to the brightness.
     slope: f32,
 }
 
@@ -216,15 +216,15 @@ impl Slice {
         [0, 1].map(|i| mix(&before[i], &after[i], self.w_column))
     }
 
-    /// `x` by the map of the pixel.
+    /// Applies the map of the pixel to `x`.
     #[inline(always)]
     fn apply(&self, maps: &[Map], x: [f32; 3]) -> [f32; 4] {
         let [dark, bright] = self.maps(maps);
         apply(&mix(&dark, &bright, self.w_bright), x)
     }
 
-    /// The VJP of [`Self::apply`] and of saturation at 1: `v` of their result becomes that of `x`, and of the maps of the row, where it
-    /// is added.
+    /// The VJP of [`Self::apply`] and of saturation at 1: from the gradient `v` of their result, returns that of `x`, and adds that of the
+    /// row's maps to `v_maps`.
     #[inline(always)]
     fn vjp(&self, maps: &[Map], x: [f32; 3], v: [f32; 3], v_maps: &mut [Map]) -> [f32; 3] {
         let [dark, bright] = self.maps(maps);
@@ -303,7 +303,7 @@ impl<'a> Frame<'a> {
     }
 }
 
-/// [`BilateralGrid::develop`] of a piece of rows from `first_row` on.
+/// [`BilateralGrid::develop`] for a piece of rows that begins at `first_row`.
 struct DevelopRows<'a> {
     frame: &'a Frame<'a>,
     first_row: usize,
@@ -333,7 +333,7 @@ impl Kernel for DevelopRows<'_> {
     }
 }
 
-/// [`BilateralGrid::vjp`] of such a piece: the first row of the grid that it touches, and the gradients of maps from there on.
+/// [`BilateralGrid::vjp`] for such a piece. Returns the first row of the grid that it touches, and the gradients of the maps from there on.
 struct VjpRows<'a> {
     frame: &'a Frame<'a>,
     first_row: usize,
@@ -405,7 +405,7 @@ fn vjp(grid: &[f32], width: usize, color: &[f32], v: &mut [f32]) -> Vec<f32> {
 /// Adds the gradient of `weight` times the total variation of `grid`: for each axis the mean squared difference of adjacent cells.
 fn add_variation_gradient(grid: &[f32], weight: f32, to: &mut [f32]) {
     for axis in 0..SIZE.len() {
-        // Numbers from a value to that of the next cell along the axis, and from one line of such cells to the next.
+        // Distances in memory from a value to that of the next cell along the axis, and from one line of such cells to the next.
         let stride = SIZE[axis + 1..].iter().product::<usize>() * N;
         let block = SIZE[axis] * stride;
         let pairs = (CELLS * N / SIZE[axis]) * (SIZE[axis] - 1);
@@ -461,7 +461,7 @@ impl Occupant for BilateralGrid {
         for (i, (view, steps)) in views.iter().zip(steps).enumerate() {
             let plane = |values: &[f32]| Planes::from_interleaved(1, &values[i * CELLS * N..][..CELLS * N]);
             let place = self.views.get_mut(*view as usize);
-            *place.ok_or("views names one that the dataset does not have")? = Some(Learnt {
+            *place.ok_or("views contains one that the dataset does not have")? = Some(Learnt {
                 own: plane(&own),
                 moments: [plane(&moments[0]), plane(&moments[1])],
                 steps,

@@ -1,4 +1,5 @@
-//! A small field that adds to the splats' colours, by position and viewing direction: what both occupants of the socket at colour are.
+//! A small field that adds to the splats' colours, by position and viewing direction. Both occupants of the socket at colour are such
+//! fields.
 
 use super::Occupant;
 use crate::field_file;

@@ -17,7 +17,7 @@ const IDENTITY: [f32; N] = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.
 const PIECE: usize = 4096;
 
 /// An affine colour map per view, initially the identity. The mean over the training views stays the identity: a change common
-/// to all photographs belongs to the scene, which would otherwise drift to an exposure of no photograph.
+/// to all photographs belongs to the scene, which would otherwise drift to an exposure that no photograph has.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Exposure {
     /// `[views][N]`.
@@ -86,7 +86,7 @@ impl Exposure {
         }
     }
 
-    /// `color` `[3, H, W]` as in the photograph of `view`, at most 1.
+    /// Applies the map of `view` to `color` `[3, H, W]`; results are at most 1.
     pub fn develop(&self, view: usize, color: &[f32], to: &mut Vec<f32>) {
         let (m, pixels) = (&self.maps[view], color.len() / 3);
         to.resize(color.len(), 0.0);

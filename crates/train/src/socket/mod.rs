@@ -72,7 +72,7 @@ fn sum_of<const N: usize>(pieces: &[[f64; N]]) -> [f32; N] {
     total.map(|v| v as f32)
 }
 
-/// What is added to the colours of splats in view, by each that adds any.
+/// The sum of the colours that two occupants add to the splats in view, of which either may be absent.
 pub(crate) fn sum_of_colors(a: Option<Vec<[f32; 3]>>, b: Option<Vec<[f32; 3]>>) -> Vec<[f32; 3]> {
     match (a, b) {
         (Some(mut colors), Some(others)) => {
@@ -85,7 +85,7 @@ pub(crate) fn sum_of_colors(a: Option<Vec<[f32; 3]>>, b: Option<Vec<[f32; 3]>>) 
     }
 }
 
-/// The last of the `layers` that are there, else `frame`: what the next one changes.
+/// The last of the `layers` that are present, else `frame`: the input of the next layer.
 fn topmost<'a>(frame: &'a [f32], layers: &[(bool, &'a Vec<f32>)]) -> &'a [f32] {
     let there = layers.iter().rev().find(|(there, _)| *there);
     there.map_or(frame, |(_, layer)| layer)
@@ -140,7 +140,7 @@ impl Sockets {
     /// The occupants that `recipe` requests, untrained. `transparent`: photographs have alpha.
     ///
     /// # Errors
-    /// When the cameras determine no space for a residual field.
+    /// If the cameras do not determine a space for a residual field.
     pub fn new(recipe: &Recipe, dataset: &Dataset, transparent: bool, seed: u64) -> Result<Self, TrainError> {
         let space = || {
             let cameras: Vec<Camera> = dataset.train.iter().map(|i| dataset.views[*i].camera).collect();
@@ -201,7 +201,7 @@ impl Sockets {
             .collect()
     }
 
-    /// Whether there are none: a step then is one of the splats alone.
+    /// Whether there are none: a step then trains only the splats.
     pub fn are_empty(&self) -> bool {
         self.poses.is_none() && !self.are_at_color() && !self.are_after_blending()
     }
@@ -222,7 +222,7 @@ impl Sockets {
         self.occupants().into_iter().filter_map(file).collect()
     }
 
-    /// Before projection: the splats and the camera of `view` at its time, with refinements.
+    /// Before projection: the camera of `view`, with refinements.
     pub fn place(&self, view: usize, camera: &Camera) -> Placement {
         match &self.poses {
             Some(poses) => poses.refined(view, camera).into(),
@@ -230,7 +230,8 @@ impl Sockets {
         }
     }
 
-    /// Renders `placement`, with colours added at colour and the map applied after blending; [`Self::frame_color`] is the result.
+    /// Renders `placement`, with colours added at colour, and sky and colour maps applied after blending; [`Self::frame_color`] is the
+    /// result.
     pub fn render(
         &mut self,
         engine: &mut Engine,

@@ -10,7 +10,7 @@ use irradia_splat::Surface;
 
 /// Random stream, derived from the run's seed.
 const STREAM_RESIDUAL: u64 = 8;
-/// It is the same in all photographs.
+/// The field's output, which is the same for all photographs.
 const TERMS: Terms = &[(None, 1.0)];
 
 /// A residual field in training.

@@ -1,9 +1,10 @@
-//! After blending, before the exposure: a sky behind the splats, with colours of its own for each photograph.
+//! After blending, before the exposure: a sky behind the splats, with separate colours for each photograph.
 //!
-//! Photographs of many days have skies that no scene can show at once: splats explain them by fog around everything in front. Here what
-//! splats leave uncovered has a colour that is linear in the direction, as a clear or overcast sky nearly is within a photograph's
+//! Photographs taken on many days have skies that one scene cannot show: splats explain them by fog around everything in front. Here
+//! whatever splats leave uncovered has a colour that is linear in the direction, as a clear or overcast sky nearly is within a photograph's
 //! field of view: `c + G d`, one for all photographs plus one for each. (Per-image backgrounds: "Splatfacto-W", Xu et al. 2024, and
-//! "WildGaussians", Kulhanek et al. 2024, learn them by a network or as splats.) The sky is no splat: it has no alpha in exported scenes.
+//! "WildGaussians", Kulhanek et al. 2024, learn them by a network or as splats.) The sky does not consist of splats: exported scenes have
+//! no alpha there.
 
 use super::per_view::PerViewAdam;
 use super::{Occupant, pieces};
@@ -17,14 +18,16 @@ use safetensors::SafeTensors;
 const TERMS: usize = 4;
 /// Parameters of a sky: the terms of red, of green, of blue.
 const N: usize = 3 * TERMS;
-/// Pixels between those whose viewing directions are computed.
+/// Distance between pixels whose viewing directions are computed; directions between them are interpolated.
 const SPACING: u32 = 8;
-/// The first colour of every sky.
+/// Smallest cosine between two such directions for interpolation (26 degrees): they are further apart where a lens ends between them.
+const SMOOTH: f32 = 0.9;
+/// The initial parameters of the common sky.
 const GREY: [f32; N] = [0.5, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0];
-/// Weight of the squares of what a photograph's sky has of its own: where a photograph shows none, its sky is that of the others.
+/// Weight of the squared differences of a photograph's sky from the common one: a photograph that shows no sky has the common one.
 const OWN_WEIGHT: f32 = 1e-4;
 
-/// Colours of the sky: those common to all photographs, and the differences of each.
+/// Colours of the sky: those common to all photographs, and the differences of each photograph from them.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Sky {
     common: [f32; N],
@@ -48,21 +51,29 @@ fn color(sky: &[f32; N], direction: Vec3) -> [f32; 3] {
     std::array::from_fn(|c| (0..TERMS).map(|k| sky[TERMS * c + k] * terms[k]).sum())
 }
 
-/// Unit viewing directions, world, of the pixels of `row`. They are linear between every [`SPACING`]th, since the inverse of a lens is slow; for
-/// a pinhole they are exact.
+/// Unit viewing directions, world, of the pixels of `row`. They are interpolated between every [`SPACING`]th pixel, since the inverse of a
+/// lens is slow; for a pinhole they are exact.
 fn directions(camera: &Camera, row: usize) -> impl Iterator<Item = Vec3> {
     let (k, rotation) = (camera.intrinsics, camera.pose.rotation);
     let ray = move |column: u32| k.ray(Vec2::new(column as f32 + 0.5, row as f32 + 0.5));
     (0..k.width.div_ceil(SPACING)).flat_map(move |piece| {
         let first = piece * SPACING;
         let (start, end) = (ray(first), ray(first + SPACING));
+        let is_smooth = start.normalize().dot(end.normalize()) > SMOOTH;
         let step = (end - start) / SPACING as f32;
-        (0..SPACING.min(k.width - first)).map(move |i| rotation * (start + step * i as f32).normalize())
+        (0..SPACING.min(k.width - first)).map(move |i| {
+            let along = if is_smooth {
+                start + step * i as f32
+            } else {
+                ray(first + i)
+            };
+            rotation * along.normalize()
+        })
     })
 }
 
 impl Sky {
-    /// A grey one for the views of `dataset`.
+    /// A grey sky for the views of `dataset`.
     pub fn new(dataset: &Dataset) -> Self {
         let axes = dataset
             .train
@@ -92,7 +103,7 @@ impl Sky {
         color(&mean, self.axis).map(|v| v.clamp(0.0, 1.0))
     }
 
-    /// `color` `[3, H, W]`, rendered over black with coverage `alpha` `[H, W]`, over the sky of `view`.
+    /// Puts the sky of `view` behind `frame`: a colour `[3, H, W]` rendered over black, and its coverage `[H, W]`.
     pub fn put_behind(&self, view: usize, camera: &Camera, frame: [&[f32]; 2], to: &mut Vec<f32>) {
         let ([from, alpha], sky) = (frame, self.of(view));
         let (width, pixels) = (camera.intrinsics.width as usize, alpha.len());
@@ -153,13 +164,13 @@ impl Sky {
 /// The background in the file of [`Sky::export`].
 ///
 /// # Errors
-/// One line, when it is no such file.
+/// One line, if it is not such a file.
 pub fn background_of_sky(file: &[u8]) -> Result<[f32; 3], String> {
     let file = SafeTensors::deserialize(file).map_err(|error| error.to_string())?;
     let found = TensorSource::new(&file, "").real("background");
     let color: Option<[f32; 3]> = found.and_then(|values| values.try_into().ok());
     let valid = color.filter(|color| color.iter().all(|v| (0.0..=1.0).contains(v)));
-    valid.ok_or_else(|| "background is missing or no colour".into())
+    valid.ok_or_else(|| "background is missing or not a colour".into())
 }
 
 impl Occupant for Sky {
@@ -200,8 +211,9 @@ impl Occupant for Sky {
 mod tests {
     use super::*;
     use glam::Quat;
-    use irradia_scene::{Intrinsics, Pose, Rng};
+    use irradia_scene::{Intrinsics, Lens, Pose, Rng};
     use irradia_testkit::differences::Differences;
+    use std::f32::consts::TAU;
 
     const SIZE: [u32; 2] = [9, 7];
     const PIXELS: usize = 63;
@@ -231,6 +243,43 @@ mod tests {
             random(PIXELS, 1.0),
             random(3 * PIXELS, 1.0),
         )
+    }
+
+    /// Also where the lens ends inside a block: at the right edge of a panorama and at the border of a fisheye's image.
+    #[test]
+    fn directions_are_those_of_the_lens() {
+        let fisheye = Lens::fisheye([0.0; 4]);
+        let round = Intrinsics::from_fov_x(360, 360, 1.0);
+        let fisheye = Intrinsics {
+            fx: 60.0,
+            fy: 60.0,
+            lens: fisheye,
+            ..round
+        };
+        let panorama = Intrinsics {
+            fx: 64.0 / TAU,
+            fy: 64.0 / TAU,
+            width: 64,
+            height: 32,
+            cx: 32.0,
+            cy: 16.0,
+            lens: Lens::Equirectangular,
+        };
+        for k in [fisheye, panorama] {
+            let camera = Camera::new(camera().pose, k);
+            let row = k.height as usize / 2;
+            for (x, direction) in directions(&camera, row).enumerate() {
+                let pixel = Vec2::new(x as f32 + 0.5, row as f32 + 0.5);
+                if let Some(expected) = k.lens.direction(k.plane_of(pixel.as_dvec2())) {
+                    let expected = camera.pose.rotation * expected.as_vec3().normalize();
+                    assert!(
+                        expected.dot(direction) > 0.9999,
+                        "{x} of {}: {direction} for {expected}",
+                        k.width
+                    );
+                }
+            }
+        }
     }
 
     fn loss(sky: &Sky, color: &[f32], alpha: &[f32], weights: &[f32]) -> f64 {

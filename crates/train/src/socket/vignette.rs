@@ -1,9 +1,9 @@
 //! After blending: how much light a lens loses towards the corners, the same in all of its photographs.
 //!
-//! The polynomial of Goldman ("Vignette and Exposure Calibration and Compensation", 2010) and of panorama programs: `y = x (1 + a u + b u^2 + c u^3)`,
-//! `u` the squared distance from the principal point, 1 at the corners of a centred image; here on sRGB-encoded colours. A scene cannot darken
-//! what stands in a corner of a photograph and not elsewhere, but for veils before the camera. It is the lens's, not a photograph's: held-out views
-//! have it as well.
+//! The polynomial of Goldman ("Vignette and Exposure Calibration and Compensation", 2010) and of panorama programs:
+//! `y = x (1 + a u + b u^2 + c u^3)`, `u` the squared distance from the principal point, 1 at the corners of a centred image; here on
+//! sRGB-encoded colours. A scene can darken the corners of a photograph, and nothing else, only by veils in front of the camera. The
+//! vignette belongs to the lens, not to a photograph: held-out views have it as well.
 
 use super::per_view::PerViewAdam;
 use super::{Occupant, pieces, sum_of};
@@ -14,19 +14,19 @@ use safetensors::SafeTensors;
 
 /// Parameters of a lens: a, b, c.
 const N: usize = 3;
-/// Relative difference of proportions and of focal lengths up to which images are by the same lens.
+/// Maximum relative difference of proportions, and of focal lengths, between images by the same lens.
 const SAME: f32 = 0.03;
-/// The least gain.
+/// The minimum gain.
 const MIN_GAIN: f32 = 0.05;
 /// Rows whose gradients are summed together: a fixed number, so that the sum does not depend on threads.
 const ROWS: usize = 16;
 
-/// What tells lenses apart, whatever the size of the image and its orientation.
+/// The properties by which lenses are told apart, independent of the image's size and orientation.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Lens {
-    /// The shorter side by the longer one.
+    /// The shorter side divided by the longer one.
     proportion: f32,
-    /// Focal length by the longer side.
+    /// Focal length divided by the longer side.
     focal: f32,
 }
 
@@ -44,7 +44,7 @@ impl Lens {
         near(self.proportion, other.proportion) && near(self.focal, other.focal)
     }
 
-    /// Whether the image is the face of a cube: no lens made its corners.
+    /// Whether the image is the face of a cube, whose corners are not those of a lens.
     fn is_face(self) -> bool {
         self.proportion == 1.0 && (self.focal - 0.5).abs() < 1e-3
     }
@@ -205,7 +205,7 @@ fn gain([a, b, c]: [f32; N], u: f32) -> f32 {
     (1.0 + u * (a + u * (b + u * c))).max(MIN_GAIN)
 }
 
-/// What a photograph holds of `value` where the gain is `gain`.
+/// `value` as the photograph shows it where the gain is `gain`.
 fn seen(value: f32, gain: f32) -> f32 {
     (value * gain).min(1.0)
 }
@@ -254,7 +254,7 @@ mod tests {
     const WIDTH: u32 = 7;
     const HEIGHT: u32 = 37;
 
-    /// A photograph by each of the lenses: width, height, focal length by the longer side.
+    /// A photograph by each of the lenses: width, height, focal length divided by the longer side.
     fn dataset(lenses: &[(u32, u32, f32)]) -> Dataset {
         let mut data = free_space::tests::dataset(0, None);
         let view = data.views[0].clone();

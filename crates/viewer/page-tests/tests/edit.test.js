@@ -1,4 +1,4 @@
-// Editing in the page: tools, handles, undo, files. What the page does is what the program does with the list it saved.
+// Editing in the page: tools, handles, undo, files. The page's result is that of the program with the saved list.
 
 import assert from "node:assert/strict";
 import { join } from "node:path";
@@ -15,14 +15,14 @@ after(async () => {
   await browser.close();
 });
 
-/** A copy of the run, so that what is saved disturbs no other test. @param {string} name */
+/** A copy of the run, so that saved files do not disturb other tests. @param {string} name */
 function copy(name) {
   const out = join(scratch, name);
   if (!existsSync(out)) cpSync(trained(), out, { recursive: true });
   return out;
 }
 
-/** Waits until the server has done what was asked, and its picture is here. @param {(editing: any) => boolean} holds */
+/** Waits until the server has carried out the requests, and its picture has arrived. @param {(editing: any) => boolean} holds */
 async function edited(page, holds) {
   const end = Date.now() + 120000;
   for (;;) {
@@ -35,7 +35,7 @@ async function edited(page, holds) {
   await sharp(page);
 }
 
-/** Drags along points, as shares of the stage. */
+/** Drags along points, given as shares of the stage. */
 async function drag(page, points, modifiers = []) {
   const box = await page.locator("irr-stage .overlay").boundingBox();
   const at = ([x, y]) => [box.x + x * box.width, box.y + y * box.height];
@@ -169,7 +169,7 @@ test("a lasso, a brush and a deletion; undo, save and download agree with the pr
   await edited(page, (e) => Boolean(e.saved));
   assert.ok(existsSync(join(scene, "scene.edits.toml")) && existsSync(join(scene, "scene.edited.ply")));
   assert.match(readFileSync(join(scene, "scene.edits.toml"), "utf8"), /op = "delete"/);
-  // The program makes the same scene of the list, and the page shows it as the same picture.
+  // The program makes the same scene from the list, and the page shows the same picture of it.
   const replayed = join(scratch, "replayed.ply");
   run("edit", join(scene, "scene.ply"), "-o", replayed, "--edits", join(scene, "scene.edits.toml"));
   assert.deepEqual(readFileSync(replayed), readFileSync(join(scene, "scene.edited.ply")));
@@ -220,7 +220,7 @@ test("handles move what is selected, which stays selected, and a region is pulle
   const size = (box) => Math.hypot(...box[1].map((v, c) => v - box[0][c]));
   assert.ok(size(scaled.box) > 1.05 * size(moved.box));
 
-  // Sliders: one entry of the list for all moves of a slider.
+  // All moves of a slider are one entry of the list.
   await page.getByLabel("Exposure").fill("1");
   await page.getByLabel("Exposure").fill("2");
   await edited(page, (e) => e.at === 4);
@@ -255,7 +255,7 @@ test("turning the scene upright keeps the picture, and views stay in place", asy
   assert.ok(psnr(opened, await picture(page)) > 45, "the camera turns with the scene");
   const up = await get(page, "up");
   assert.ok(up[1] < -0.9999, `up is ${up}`);
-  // A page that opens now sees the same from the same place.
+  // A page that is opened now sees the same from the same place.
   const late = await open(browser, server.address, { width: 800, height: 560 });
   const placed = (page) => page.evaluate(async () => (await import("/page/js/state.js")).state.get("views").map((view) => view.position).flat());
   const [here, there] = [await placed(page), await placed(late.page)];

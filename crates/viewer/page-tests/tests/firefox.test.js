@@ -12,9 +12,9 @@ import { trained } from "./scenes.js";
 import { isSettled, looksAsDrawn, SIZE, watch } from "./shared.js";
 
 const FIREFOX = [process.env.FIREFOX, "/usr/bin/firefox-esr", "/usr/bin/firefox"].find((path) => path && existsSync(path));
-// Headless, Firefox has no WebGL without a GPU: it gets a screen in memory, where Mesa draws.
+// Headless Firefox has no WebGL without a GPU: it gets a virtual screen, on which Mesa draws.
 const XVFB = "/usr/bin/Xvfb";
-const skip = !FIREFOX ? "there is no Firefox" : !process.env.DISPLAY && !existsSync(XVFB) ? "there is neither a screen nor Xvfb" : false;
+const skip = !FIREFOX ? "Firefox is not installed" : !process.env.DISPLAY && !existsSync(XVFB) ? "there is neither a screen nor Xvfb" : false;
 if (skip) console.log(`SKIPPED: shared pages were NOT opened in Firefox: ${skip}`);
 
 /** @type {import("node:child_process").ChildProcess | undefined} */
@@ -22,7 +22,7 @@ let screen;
 /** @type {import("puppeteer-core").Browser} */
 let browser;
 
-/** Starts a screen in memory and returns its name. */
+/** Starts a virtual screen and returns its name. */
 const startScreen = () => new Promise((resolve, reject) => {
   screen = spawn(XVFB, ["-displayfd", "3", "-screen", "0", "1280x800x24"], { stdio: ["ignore", "ignore", "ignore", "pipe"] });
   screen.on("error", reject);
@@ -38,7 +38,7 @@ before(async () => {
     executablePath: FIREFOX,
     headless: false,
     env: { ...process.env, DISPLAY: display, LIBGL_ALWAYS_SOFTWARE: "1" },
-    // There is no network: what is asked for goes to a proxy that is not there.
+    // No network: requests go to a proxy that does not exist.
     extraPrefsFirefox: { "webgl.force-enabled": true, "network.proxy.type": 1, "network.proxy.http": "127.0.0.1", "network.proxy.http_port": 9, "network.proxy.ssl": "127.0.0.1", "network.proxy.ssl_port": 9 },
   });
 });

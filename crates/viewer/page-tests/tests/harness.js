@@ -20,9 +20,9 @@ process.on("exit", () => rmSync(scratch, { recursive: true, force: true }));
 /** Runs the program to its end. @param {...string} args */
 export const run = (...args) => execFileSync(PROGRAM, args, { stdio: ["ignore", "pipe", "pipe"], encoding: "utf8" });
 
-/** Programs that still serve, after a test that failed for example. @type {Set<import("node:child_process").ChildProcess>} */
+/** Programs that are still serving, for example after a failed test. @type {Set<import("node:child_process").ChildProcess>} */
 const serving = new Set();
-/** Ends them. */
+/** Ends all programs that are still serving. */
 export const stopAll = () => serving.forEach((child) => child.kill("SIGKILL"));
 
 /** Starts a command that serves a page. @param {...string} args */
@@ -56,7 +56,7 @@ const CHROMIUM = [process.env.CHROMIUM, "/usr/bin/chromium", "/usr/bin/chromium-
 const WEBGL = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"];
 const WEBGPU = ["--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan", "--use-vulkan=swiftshader", "--disable-gpu-watchdog"];
 
-/** A headless browser; with WebGL or WebGPU too it draws everything by a software rasteriser, which is slower.
+/** A headless browser; with WebGL or WebGPU it draws everything with a software rasteriser, which is slower.
  * @param {"webgl" | "webgpu" | null} [api] */
 export const browse = (api = null) => chromium.launch({
   executablePath: CHROMIUM,
@@ -64,7 +64,7 @@ export const browse = (api = null) => chromium.launch({
     ...(api ? [...WEBGL, ...(api === "webgpu" ? WEBGPU : [])] : ["--disable-gpu", "--disable-software-rasterizer"])],
 });
 
-/** For `addInitScript`: WebGPU's software says that it is a GPU, since pages leave software to WebGL2. */
+/** For `addInitScript`: WebGPU in software claims to be a GPU, since pages do not use WebGPU in software. */
 export function pretendGpu() {
   for (const [key, value] of Object.entries({ isFallbackAdapter: false, architecture: "tested" })) Object.defineProperty(GPUAdapterInfo.prototype, key, { get: () => value });
 }
@@ -83,7 +83,7 @@ export async function open(browser, address, { width = 1440, height = 900, theme
   return { page, problems, context };
 }
 
-/** Waits for the final picture of the present camera. */
+/** Waits for the final picture of the current camera. */
 export async function sharp(page) {
   await page.evaluate(async () => {
     await document.querySelector("irr-stage").local.ready;
@@ -109,7 +109,7 @@ export async function until(page, holds, argument = null, seconds = 120) {
 export async function picture(page) {
   const address = await page.evaluate(() => {
     const { drawsLocally, local, served } = document.querySelector("irr-stage");
-    // WebGPU's canvas is empty once the browser has composed it.
+    // WebGPU's canvas is empty after the browser has composed it.
     if (drawsLocally) local.painter.present();
     return (drawsLocally ? local.canvas : served).toDataURL("image/png");
   });
@@ -119,7 +119,7 @@ export async function picture(page) {
 /** Changes the page's state. @param {import("playwright-core").Page} page @param {object} values */
 export const set = (page, values) => page.evaluate(async (values) => {
   (await import("/page/js/state.js")).state.set(values);
-  // The layout follows in the next frame, and the picture's size after it.
+  // The layout changes in the next frame, and the picture's size after that.
   for (let i = 0; i < 3; i += 1) await new Promise(requestAnimationFrame);
 }, values);
 export const get = (page, key) => page.evaluate(async (key) => (await import("/page/js/state.js")).state.get(key), key);
@@ -128,7 +128,7 @@ export const readPng = (path) => PNG.sync.read(readFileSync(path));
 
 let frames = 0;
 
-/** The program's picture of a page's camera. */
+/** The program's picture from a page's camera. */
 export function renderFrom(camera, scene, { width, height }) {
   const out = join(scratch, `frames_${(frames += 1)}`);
   const file = `${out}.json`;

@@ -1,4 +1,4 @@
-// Pictures on the page against those that `irradia render` draws of the same camera.
+// Compares pictures on the page with those that `irradia render` draws from the same camera.
 
 import assert from "node:assert/strict";
 import { readdirSync, writeFileSync } from "node:fs";
@@ -7,7 +7,7 @@ import { after, before, test } from "node:test";
 import { browse, get, open, picture, pretendGpu, psnr, readPng, renderFrom, run, scratch, serve, set, sharp, stopAll, until } from "./harness.js";
 import { field, fox, random, shiny, trained } from "./scenes.js";
 
-/** One shows pictures, the others draw them. @type {Record<"browser" | "drawing" | "computing", import("playwright-core").Browser>} */
+/** One browser shows served pictures, the others draw. @type {Record<"browser" | "drawing" | "computing", import("playwright-core").Browser>} */
 let { browser, drawing, computing } = {};
 before(async () => ([browser, drawing, computing] = [await browse(), await browse("webgl"), await browse("webgpu")]));
 after(async () => {
@@ -15,7 +15,7 @@ after(async () => {
   await Promise.all([browser, drawing, computing].map((one) => one.close()));
 });
 
-/** The program's picture of the page's camera. */
+/** The program's picture from the page's camera. */
 const rendered = async (page, scene, size) => renderFrom(await get(page, "camera"), scene, size);
 
 /** Drags over the stage. */
@@ -101,7 +101,7 @@ test("a moving camera gets a level of detail from afar, here and from the server
     const { counts, loaded } = document.querySelector("irr-stage").local.levels;
     return counts.length === 4 && loaded.every((count, i) => count === counts[i]);
   });
-  // So far that a level is dense at every resolution: the machine's speed decides that. A little farther with every frame.
+  // So far away that a level is dense at every resolution, which depends on the machine's speed. A little farther with every frame.
   const levels = await page.evaluate(async () => {
     const stage = document.querySelector("irr-stage");
     const { state } = await import("/page/js/state.js");
@@ -132,13 +132,13 @@ test("a moving camera gets a level of detail from afar, here and from the server
   await server.stop();
 });
 
-/** What paints in the page, and what the panel says of it. */
+/** What paints in the page, and what the panel says about it. */
 const painter = (page) => page.evaluate(() => {
   const { api, reason } = document.querySelector("irr-stage").local;
   return { api, reason, text: document.querySelector("irr-display-panel").textContent };
 });
 
-/** WebGPU's software is slow: small pictures. */
+/** Small pictures, since WebGPU in software is slow. */
 const SMALL = { width: 320, height: 240 };
 
 for (const [name, make] of [["a trained scene", trained], ["random splats", () => random(4000)]]) {

@@ -1,4 +1,4 @@
-// Scenes to look at: trained in moments, or written here.
+// Scenes for the tests: trained in a moment, or written here.
 
 import { cpSync, existsSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
@@ -20,7 +20,7 @@ export function trained() {
   return out;
 }
 
-/** A run whose view `dark` was exposed at half of the others' light. @param {number} views @param {number} dark */
+/** A run whose view `dark` was exposed to half the light of the others. @param {number} views @param {number} dark */
 export function lit(views, dark) {
   const out = join(scratch, "lit");
   if (existsSync(out)) return out;
@@ -48,7 +48,7 @@ export function shiny() {
   return out;
 }
 
-/** A run on photographs, if they are there. */
+/** A run on photographs, if they exist. */
 export function fox() {
   if (!existsSync(join(shared, "fox_colmap"))) return null;
   const out = join(scratch, "fox");

@@ -1,4 +1,4 @@
-// The page as a new user meets it: views, tools, a live training, several pages, a server that dies.
+// The page as a new user finds it: views, tools, a live training, several pages, a server that dies.
 
 import assert from "node:assert/strict";
 import { join } from "node:path";
@@ -28,7 +28,7 @@ test("views, comparison, tools and modes", async () => {
   assert.equal(await get(page, "view"), 3);
   await page.getByRole("button", { name: "Slider" }).click();
   await page.locator("img.photo").waitFor({ state: "visible" });
-  // The picture lies exactly over the photograph.
+  // The picture is exactly over the photograph.
   const size = await page.evaluate(() => [document.querySelector("irr-stage").served.width, document.querySelector("irr-stage").served.height]);
   assert.ok(Math.abs(size[0] / size[1] - 160 / 120) < 0.01);
   await page.getByRole("button", { name: "Error", exact: true }).click();
@@ -102,13 +102,13 @@ test("a scene is shown in the light of one of its photographs", async () => {
   await select.selectOption(`${dark}`);
   await settled(page);
   assert.ok(psnr(darker, await picture(page)) > 36, "half of the light");
-  // The page itself knows no lights.
+  // The page itself cannot draw in the light of a photograph.
   await set(page, { drawing: "local" });
   assert.equal(await page.evaluate(() => document.querySelector("irr-stage").drawsLocally), false);
   await set(page, { light: null, drawing: "served" });
   await settled(page);
   assert.ok(psnr(mean, await picture(page)) > 45);
-  // Beside its photograph a scene has that one's light.
+  // Compared with a photograph, the scene is shown in its light.
   await page.evaluate((dark) => document.querySelector("irr-stage").navigation.enter(dark), dark);
   await until(page, async (dark) => (await import("/page/js/state.js")).state.get("view") === dark, dark);
   await settled(page);
@@ -147,7 +147,7 @@ test("a live training is paused, stepped, resumed and left alone, and its bytes 
   await page.screenshot({ path: join(OUT, "training-1440-dark.jpg"), quality: 80 });
   await page.getByRole("button", { name: "Resume" }).click();
   await until(page, async (step) => (await import("/page/js/state.js")).state.get("train").step > step + 60, step);
-  // A page that closes disturbs nothing; the other one sees the scene improve.
+  // Closing a page has no effect on the other one, which sees the scene improve.
   await second.page.close();
   await until(page, async () => (await import("/page/js/state.js")).state.get("train").phase === "finished");
   await sharp(page);
@@ -187,7 +187,7 @@ test("an address holds the camera", async () => {
   await page.locator("irr-stage .overlay").hover();
   const before = (await get(page, "camera")).position;
   await page.mouse.wheel(0, -300);
-  // Playwright does not wait for the page to see the wheel, or for its own `url()` to follow the address bar.
+  // Playwright does not wait until the page receives the wheel event, or until its own `url()` follows the address bar.
   await until(page, async (before) => (await import("/page/js/state.js")).state.get("camera").position.some((v, i) => v !== before[i]), before);
   await page.keyboard.press("u");
   await until(page, () => location.hash.startsWith("#p="));

@@ -1,4 +1,4 @@
-// What tests of shared pages have in common, whatever the browser: pages of Playwright and of Puppeteer.
+// Helpers for tests of shared pages in any browser: pages of Playwright and of Puppeteer.
 
 import assert from "node:assert/strict";
 import { join } from "node:path";
@@ -7,7 +7,7 @@ import { OUT, psnr, renderFrom } from "./harness.js";
 
 export const SIZE = { width: 640, height: 360 };
 
-/** Collects the page's errors, and the addresses that it asks for. */
+/** Collects the page's errors, and the addresses that it requests. */
 export function watch(page) {
   const problems = [];
   const asked = [];
@@ -26,19 +26,19 @@ export const isSettled = () => {
 /** The page's picture. */
 export async function shown(page) {
   const address = await page.evaluate(() => {
-    // WebGPU's canvas is empty once the browser has composed it.
+    // WebGPU's canvas is empty after the browser has composed it.
     /** @type {any} */ (window).irradia.renderer.painter.present();
     return document.querySelector("canvas").toDataURL("image/png");
   });
   return PNG.sync.read(Buffer.from(address.split(",")[1], "base64"));
 }
 
-/** The program's picture of the page's camera. */
+/** The program's picture from the page's camera. */
 export const rendered = async (page, scene, size = SIZE) =>
   renderFrom(await page.evaluate(() => /** @type {any} */ (window).irradia.camera()), scene, size);
 
-/** The page looks as the program draws it, before and after a drag and `zoom`; `settled` waits for its final picture. Returns the first
- * PSNR, and leaves a screenshot. */
+/** Asserts that the page looks as the program draws it, before and after a drag and `zoom`; `settled` waits for its final picture. Returns
+ * the first PSNR, and writes a screenshot. */
 export async function looksAsDrawn(page, scene, screenshot, { settled, zoom }) {
   const first = await shown(page);
   const db = psnr(first, await rendered(page, scene));
@@ -51,7 +51,7 @@ export async function looksAsDrawn(page, scene, screenshot, { settled, zoom }) {
   const camera = () => page.evaluate(() => JSON.stringify(/** @type {any} */ (window).irradia.camera()));
   const dragged = await camera();
   await zoom();
-  // The page may see the wheel later than the browser took it.
+  // The page may receive the wheel event later than the browser.
   const end = Date.now() + 120000;
   while ((await camera()) === dragged) {
     assert.ok(Date.now() < end, "the page never saw the wheel");

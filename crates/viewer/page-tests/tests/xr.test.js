@@ -1,4 +1,4 @@
-// Virtual reality, as far as a browser without a headset goes: a session made up here takes the place of a headset's.
+// Virtual reality, as far as a browser without a headset allows: a simulated session replaces that of a headset.
 
 import assert from "node:assert/strict";
 import { after, before, test } from "node:test";
@@ -13,7 +13,7 @@ after(async () => {
   await browser.close();
 });
 
-/** Stands for a headset: two eyes of half the canvas each, 20 cm apart, that look as the page does. */
+/** Simulates a headset: two eyes of half the canvas each, 20 cm apart, that look in the page's direction. */
 function headset() {
   const eye = (/** @type {number} */ x) => ({ transform: { matrix: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, x, 0, 0, 1] }, projectionMatrix: new Float32Array([1.5, 0, 0, 0, 0, 1.5, 0, 0, 0, 0, -1, -1, 0, 0, -0.1, 0]) });
   const views = [eye(-0.1), eye(0.1)];
@@ -74,7 +74,7 @@ test("a session begins where one is offered, and both eyes see the scene", async
     }
     return [...sums, difference.sum].map((sum) => sum / (half * height));
   });
-  // Both eyes show something of the same brightness, from two places.
+  // Both eyes show something of the same brightness, from different positions.
   assert.ok(left > 10 && Math.abs(left / right - 1) < 0.2, `${left} ${right}`);
   assert.ok(between > 0.5 && between < left, `${between}`);
   await server.stop();

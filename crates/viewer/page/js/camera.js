@@ -1,4 +1,4 @@
-// A camera of the page, and what a picture of it needs.
+// The page's cameras, their intrinsics and projections.
 
 import { axes, dot, scale, add, subtract } from "./math.js";
 
@@ -9,10 +9,10 @@ import { axes, dot, scale, add, subtract } from "./math.js";
 /** A view of the dataset.
  * @typedef {{ name: string, trained: boolean, photo: boolean, width: number, height: number, fx: number, fy: number, cx: number,
  *   cy: number, position: Vec3, rotation: Quat }} View */
-/** Where a picture lies on the stage, CSS pixels. @typedef {{ left: number, top: number, width: number, height: number }} Frame */
+/** Where a picture is on the stage, CSS pixels. @typedef {{ left: number, top: number, width: number, height: number }} Frame */
 /** Pixels. @typedef {{ width: number, height: number, fx: number, fy: number, cx: number, cy: number }} Intrinsics */
 
-/** The part of the stage that shows exactly what view shows; all of it without a view.
+/** The part of the stage with the proportions of view, as large as possible; the whole stage without a view.
  * @param {number} width @param {number} height @param {View | null} view @returns {Frame} */
 export function frameOn(width, height, view) {
   if (!view) return { left: 0, top: 0, width, height };

@@ -30,7 +30,7 @@ class Chart extends HTMLElement {
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
     const [w, h] = [Math.round(width * density), Math.round(height * density)];
     if (canvas.width !== w || canvas.height !== h) [canvas.width, canvas.height] = [w, h];
-    // Small and rarely drawn: not worth the GPU.
+    // Small and rarely drawn: the GPU is not worth it.
     const context = canvas.getContext("2d", { willReadFrequently: true });
     if (!context) return;
     context.setTransform(density, 0, 0, density, 0, 0);

@@ -1,4 +1,4 @@
-// What the page can do, with its keys: the toolbar, the keyboard and the help sheet use this list.
+// The commands of the page with their keys: the toolbar, the keyboard and the help sheet use this list.
 
 import { connection } from "./connection.js";
 import { session } from "./edit/session.js";
@@ -14,7 +14,7 @@ export const MODES = [
   ["color", "Colour", "1"], ["depth", "Depth", "2"], ["alpha", "Alpha", "3"], ["normals", "Normals", "4"],
   ["count", "Splats per pixel", "5"], ["ellipses", "Ellipses", "6"], ["rings", "Rings", "7"], ["points", "Points", "8"],
 ];
-/** Modes for which there must be splats. */
+/** Modes that need splats. */
 export const SPLAT_MODES = ["count", "ellipses", "rings", "points"];
 
 /** @returns {import("./stage.js").Stage} */
@@ -43,15 +43,15 @@ const remove = () => {
   if (state.get("editing")?.selected) session.edit({ op: "delete" });
 };
 
-/** Puts the address of the present view on the clipboard. */
+/** Copies the address of the current view to the clipboard. */
 export async function share() {
   const address = shareAddress();
   history.replaceState(null, "", address);
   try {
     await navigator.clipboard.writeText(address);
-    state.set({ problem: "The address of this view is on the clipboard" });
+    state.set({ problem: "The address of this view was copied to the clipboard" });
   } catch {
-    state.set({ problem: "The address bar holds this view now" });
+    state.set({ problem: "The address bar now contains this view" });
   }
 }
 
@@ -101,7 +101,7 @@ export const COMMANDS = {
     { keys: "Ctrl+z", name: "Undo", run: () => session.undo() },
     { keys: "Ctrl+Shift+z", name: "Redo", run: () => session.redo() },
     { keys: "Ctrl+y", name: "", run: () => session.redo() },
-    { keys: "r", name: "Select by a rectangle", run: () => toggleEditTool("rectangle") },
+    { keys: "r", name: "Select with a rectangle", run: () => toggleEditTool("rectangle") },
     { keys: "n", name: "Select with the lasso", run: () => toggleEditTool("lasso") },
     { keys: "j", name: "Select with the brush", run: () => toggleEditTool("brush") },
     { keys: "Ctrl+a", name: "Select all", run: () => session.select([{ shape: "all" }], "replace") },
@@ -112,7 +112,7 @@ export const COMMANDS = {
   ],
   Page: [
     { keys: "b", name: "Show or hide the panel", run: () => state.set({ sidebar: !state.get("sidebar") }) },
-    { keys: "t", name: "Dark or light", run: toggleTheme },
+    { keys: "t", name: "Dark or light theme", run: toggleTheme },
     { keys: "u", name: "Share this view", run: share },
     { keys: "?", name: "This sheet", run: () => document.querySelector("irr-help")?.dispatchEvent(new Event("open")) },
     { keys: "Escape", name: "Leave the view or the tool", run: () => state.set({ tool: "none", view: null, compare: "none" }) },
@@ -123,12 +123,12 @@ addEventListener("keydown", (event) => {
   const target = /** @type {HTMLElement} */ (event.target);
   if (event.altKey || target.matches("input:not([type=range]):not([type=checkbox]), select, dialog *")) return;
   if (event.key === " " && target.matches("button, [role=button], input")) return;
-  // By their place on the keyboard, whatever its letters.
+  // These keys go by their position on the keyboard, whatever its layout.
   if (event.code in MOVES && !event.ctrlKey && !event.metaKey) return;
   const held = event.ctrlKey || event.metaKey ? (event.shiftKey ? "Ctrl+Shift+" : "Ctrl+") : "";
   const key = held ? held + event.key.toLowerCase() : event.key;
   const command = Object.values(COMMANDS).flat().find(({ keys }) => keys === key);
-  // Keys of editing are the browser's where there is nothing to edit.
+  // Without a scene to edit, the keys of editing are left to the browser.
   if (!command || (COMMANDS.Edit.includes(command) && !session.works)) return;
   event.preventDefault();
   command.run();

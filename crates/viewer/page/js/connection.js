@@ -1,11 +1,11 @@
-// The socket: requests to the server, pictures and news from it. Comes back by itself when it is lost.
+// The socket: requests to the server, pictures and news from it. Reconnects by itself.
 
 import { state } from "./state.js";
 
 /** @typedef {{ id: number, width: number, height: number, sharp: boolean, version: number, milliseconds: number,
  *   range?: [number, number] }} Header */
 
-/** Milliseconds until the next attempt: doubled up to the last. */
+/** Milliseconds until the next attempt to connect: the first wait, doubled up to the last one. */
 const FIRST_WAIT = 250;
 const LAST_WAIT = 4000;
 
@@ -95,7 +95,7 @@ class Connection extends EventTarget {
   }
 }
 
-/** News of a training, with the points of its curves that are known already. @param {any} old @param {any} fresh */
+/** News of a training, completed by the points of its curves that are known already. @param {any} old @param {any} fresh */
 function merged(old, fresh) {
   const before = old ? old.curve.slice(0, fresh.from) : [];
   return { ...fresh, curve: [...before, ...fresh.curve] };
@@ -103,6 +103,6 @@ function merged(old, fresh) {
 
 export const connection = new Connection();
 
-/** The address of a picture of a view, which the browser may keep: it names the scene.
+/** The address of a photograph or thumbnail of a view. It identifies the scene, so that the browser may cache it.
  * @param {number} index @param {"photo" | "thumbnail"} kind */
 export const pictureOf = (index, kind) => `view/${index}/${kind}${location.search ? `${location.search}&` : "?"}scene=${state.get("hello")?.id ?? ""}`;

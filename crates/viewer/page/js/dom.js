@@ -1,4 +1,4 @@
-// Elements without ceremony. Text is always set as text, never as markup.
+// Helpers that create elements. Text is always set as text, never as markup.
 
 /** @template {keyof HTMLElementTagNameMap} T
  * @param {T} tag @param {Record<string, any>} [properties] @param {...(Node | string)} children
@@ -13,7 +13,7 @@ export function el(tag, properties = {}, ...children) {
   return element;
 }
 
-/** A button that is pressed or not. @param {HTMLElement} button @param {boolean} pressed */
+/** Marks a button as pressed or not. @param {HTMLElement} button @param {boolean} pressed */
 export const press = (button, pressed) => button.setAttribute("aria-pressed", String(pressed));
 
 /** A row of a form. @param {string} label @param {...Node} controls */
@@ -31,11 +31,11 @@ let count = 0;
 /** A section of a panel. @param {string} title @param {...Node} children */
 export const section = (title, ...children) => el("section", {}, el("h2", { textContent: title }), ...children);
 
-/** Names and values. @param {[string, string][]} facts */
+/** A list of names and values. @param {[string, string][]} facts */
 export const facts = (facts) =>
   el("dl", { className: "facts" }, ...facts.flatMap(([name, value]) => [el("dt", { textContent: name }), el("dd", { textContent: value, title: value })]));
 
-/** Buttons of which one is pressed. @template {string} T
+/** A group of buttons of which one is pressed. @template {string} T
  * @param {string} label @param {[T, string, string?][]} choices value, text, hint @param {(value: T) => void} choose */
 export function segments(label, choices, choose) {
   const group = el("div", { className: "segments", role: "group", "aria-label": label });
@@ -52,7 +52,7 @@ export function choose(group, value) {
   for (const button of group.querySelectorAll("button")) press(button, button.dataset.value === value);
 }
 
-/** A number with three or four digits that matter. @param {number | null | undefined} value */
+/** A number with three or four significant digits. @param {number | null | undefined} value */
 export function short(value) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
   const size = Math.abs(value);

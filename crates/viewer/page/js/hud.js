@@ -14,7 +14,7 @@ const RAMPS = {
   grey: "linear-gradient(90deg,#000,#fff)",
 };
 
-/** Milliseconds that a message stays. */
+/** Milliseconds for which a message is shown. */
 const MESSAGE = 5000;
 
 class Hud extends HTMLElement {
@@ -47,11 +47,11 @@ class Hud extends HTMLElement {
     state.watch(["connection"], () => {
       const connection = state.get("connection");
       lost.hidden = connection === "open" || connection === "connecting";
-      lost.textContent = connection === "full" ? "Too many pages are open: waiting for a free place" : "Connection lost: trying again";
+      lost.textContent = connection === "full" ? "Too many pages are open: waiting until one is closed" : "Connection lost: reconnecting";
     });
     state.watch(["tool", "measured", "metres"], () => {
       const [a, b] = state.get("measured");
-      const hints = /** @type {Record<string, string>} */ ({ inspect: "Click a splat; Escape ends", measure: "Click two points on surfaces; Escape ends" });
+      const hints = /** @type {Record<string, string>} */ ({ inspect: "Click a splat; Escape to stop", measure: "Click two points on surfaces; Escape to stop" });
       const text = hints[state.get("tool")] ?? "";
       tool.textContent = state.get("tool") === "measure" && a && b ? distanceText(length(subtract(a, b))) : text;
       tool.hidden = !text;
@@ -69,7 +69,7 @@ class Hud extends HTMLElement {
     });
   }
 
-  /** What is shown while the camera is in a view with a photograph. */
+  /** The controls that are shown while the camera is in a view. */
   comparison() {
     const name = el("span", { className: "chip" });
     const group = segments("Compare with the photograph", [
@@ -105,7 +105,7 @@ function legendOf(header) {
   return [ramp, el("span", { textContent: text(left) }), el("span", { textContent: metres ? `${name}, m` : name, className: "quiet" }), el("span", { textContent: text(right) })];
 }
 
-/** The six axes: drag nothing, click one to look along it. @param {import("./stage.js").Stage} owner */
+/** The six directions of the axes: a click on one looks along it. @param {import("./stage.js").Stage} owner */
 function gizmo(owner) {
   const ns = "http://www.w3.org/2000/svg";
   const svg = document.createElementNS(ns, "svg");
@@ -143,11 +143,11 @@ function gizmo(owner) {
       end.stem.setAttribute("x2", cx);
       end.stem.setAttribute("y2", cy);
     }
-    // Nearest last, so that it is on top; untouched while an end has the keyboard's focus.
+    // Nearest last, so that it is on top; not reordered while an end has the keyboard focus.
     if (!svg.contains(document.activeElement)) svg.append(...order.map(({ end }) => end.group));
   };
   place();
-  // With the picture, not with each of the camera's changes in between.
+  // With each picture, not with every change of the camera in between.
   owner.addEventListener("drawing", place);
   return svg;
 }

@@ -1,4 +1,4 @@
-// The page: loads its parts, and begins.
+// Loads the parts of the page, and starts it.
 
 import "./stage.js";
 import "./hud.js";
@@ -24,7 +24,7 @@ state.watch(["hello"], () => {
   if (hello) document.title = `${hello.title} · Irradia`;
 });
 
-// The first scene decides the first camera; later versions keep it.
+// The first scene determines the first camera; later versions keep it.
 let placed = false;
 state.watch(["scene", "views"], () => {
   const scene = state.get("scene");

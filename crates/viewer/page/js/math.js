@@ -20,7 +20,7 @@ export const normalize = (a) => scale(a, 1 / Math.max(length(a), 1e-20));
 /** @param {readonly number[]} a @param {readonly number[]} b @param {number} t @returns {Vec3} */
 export const mix = (a, b, t) => [a[0] + (b[0] - a[0]) * t, a[1] + (b[1] - a[1]) * t, a[2] + (b[2] - a[2]) * t];
 
-/** First b, then a. @param {Quat} a @param {Quat} b @returns {Quat} */
+/** The rotation b followed by a. @param {Quat} a @param {Quat} b @returns {Quat} */
 export const multiply = ([aw, ax, ay, az], [bw, bx, by, bz]) => [
   aw * bw - ax * bx - ay * by - az * bz,
   aw * bx + ax * bw + ay * bz - az * by,
@@ -72,7 +72,7 @@ export const fromAxes = (x, y, z) => {
   return unit([(x[1] - y[0]) / s, (z[0] + x[2]) / s, (z[1] + y[2]) / s, s / 4]);
 };
 
-/** A unit vector across v. @param {readonly number[]} v @returns {Vec3} */
+/** A unit vector perpendicular to v. @param {readonly number[]} v @returns {Vec3} */
 export const across = (v) => {
   const axis = Math.abs(v[0]) < 0.6 ? [1, 0, 0] : [0, 1, 0];
   return normalize(cross(v, axis));

@@ -35,7 +35,7 @@ export class Navigation {
   last = 0;
 
   /** @param {HTMLElement} element @param {(x: number, y: number) => Promise<any>} pick at pixels of the element
-   * @param {(event: PointerEvent) => boolean} claimed whether a pointer is for something else */
+   * @param {(event: PointerEvent) => boolean} claimed whether a pointer is used for something else */
   constructor(element, pick, claimed) {
     this.element = element;
     this.pick = pick;
@@ -72,12 +72,12 @@ export class Navigation {
     if (dx === 0 && dy === 0) return;
     if (this.pointers.size === 2) {
       const other = [...this.pointers].find(([id]) => id !== event.pointerId)?.[1] ?? before;
-      const apart = (/** @type {{ x: number, y: number }} */ p) => Math.hypot(p.x - other.x, p.y - other.y);
+      const apart = (/** @type {{ x: number, y: number }} */ p) => Math.max(Math.hypot(p.x - other.x, p.y - other.y), 1);
       const now = { x: event.clientX, y: event.clientY };
-      this.dolly(Math.log(apart(now) / Math.max(apart(before), 1)));
+      this.dolly(Math.log(apart(now) / apart(before)));
       this.pan(dx / 2, dy / 2);
     } else if (event.buttons & (isEditTool(state.get("tool")) ? 4 : 6) || event.shiftKey) {
-      // The left button of a selection tool is taken: the right one turns.
+      // A selection tool uses the left button: the right one turns.
       this.pan(dx, dy);
     } else {
       this.turn(dx, dy);
@@ -98,13 +98,13 @@ export class Navigation {
     }
   }
 
-  /** Distance to the pivot; what one looks at while flying. */
+  /** Distance to the pivot, or to what is in view while flying. */
   get reach() {
     const scene = state.get("scene");
     return Math.max(length(subtract(state.get("pivot"), state.get("camera").position)), 0.02 * (scene?.radius ?? 1));
   }
 
-  /** A camera that the user has moved is in no view any more. @param {Partial<Camera>} change */
+  /** Changes the camera, which then is no longer in a view. @param {Partial<Camera>} change */
   place(change) {
     state.set({ camera: { ...state.get("camera"), ...change }, view: null });
   }
@@ -139,7 +139,7 @@ export class Navigation {
     if (state.get("navigation") === "orbit") state.set({ pivot: add(state.get("pivot"), shift) });
   }
 
-  /** @param {number} amount logarithm of the factor by which the pivot comes nearer */
+  /** @param {number} amount logarithm of the factor by which the distance to the pivot decreases */
   dolly(amount) {
     const camera = state.get("camera");
     if (state.get("navigation") === "orbit") {
@@ -152,7 +152,7 @@ export class Navigation {
     }
   }
 
-  /** World units a second. */
+  /** World units per second. */
   get pace() {
     return 0.5 * (state.get("scene")?.radius ?? 1) * state.get("speed");
   }
@@ -236,7 +236,7 @@ export class Navigation {
     this.flyTo({ ...camera, rotation: lookAt(camera.position, picked.point, state.get("up")) }, { pivot: picked.point });
   }
 
-  /** Shows the whole scene as its photographs do. */
+  /** Flies to the camera that shows the whole scene. */
   home() {
     const { camera, pivot } = homeOf();
     this.flyTo(camera, { pivot });
@@ -284,5 +284,5 @@ export function homeOf() {
   return { camera: { position, rotation: lookAt(position, pivot, up), fov }, pivot };
 }
 
-// The server forgets nothing by itself; a page that comes back tells it what it wants.
+// After a reconnection, the page sends its request again.
 connection.addEventListener("open", () => state.dispatchEvent(new Event("camera")));

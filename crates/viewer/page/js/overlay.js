@@ -53,7 +53,7 @@ export function drawOverlay(context, camera, k, pixel) {
   drawPath(draw, pixel);
 }
 
-/** Cameras that are drawn: not those around the present one, which would only cover the picture; none beside a photograph.
+/** Cameras that are drawn: not those near the current one, which would only cover the picture; none while comparing with a photograph.
  * @param {Camera} camera */
 function seenFrusta(camera) {
   if (!state.get("frusta") || state.get("compare") !== "none") return [];
@@ -126,7 +126,7 @@ function drawFrustum(draw, view, size, color, image) {
   const corners = [corner(0, 0), corner(view.width, 0), corner(view.width, view.height), corner(0, view.height)];
   const [a, b, , d] = corners.map((corner) => project(draw.camera, draw.k, corner));
   if (image && a && b && d) {
-    // Three corners make an affine map; the fourth is off by the perspective, which is little over a small picture.
+    // Three corners define an affine map; perspective moves the fourth, but little over a small picture.
     const [w, h] = [image.naturalWidth, image.naturalHeight];
     draw.context.save();
     draw.context.globalAlpha = 0.9;
@@ -168,10 +168,10 @@ function drawMeasured(draw, pixel) {
   context.shadowBlur = 0;
 }
 
-/** The scene's coordinates are those of its dataset, centred and scaled. @returns {{ scale: number, center: Vec3 }} */
+/** From the dataset's coordinates to the scene's, which are centred and scaled. @returns {{ scale: number, center: Vec3 }} */
 export const world = () => state.get("scene")?.world ?? { scale: 1, center: [0, 0, 0] };
 
-/** In metres, or in units of the dataset. @param {number} units of the scene */
+/** A distance in metres, or in units of the dataset. @param {number} units of the scene */
 export function distanceText(units) {
   const metres = state.get("metres");
   if (!metres) return `${(units / world().scale).toPrecision(4)} units`;

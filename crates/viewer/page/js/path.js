@@ -10,7 +10,7 @@ import { clamp, multiply, slerp, unit } from "./math.js";
 /** @typedef {import("./camera.js").Camera} Camera */
 /** @typedef {{ time: number, position: Vec3, rotation: Quat, fov: number }} Key */
 
-/** Seconds between key frames at first. */
+/** Initial time between key frames, seconds. */
 export const APART = 2;
 
 /** @param {Quat} q @returns {Quat} */
@@ -44,7 +44,7 @@ class Path extends EventTarget {
   ease = true;
   fps = 30;
   shown = false;
-  /** Seconds of a loop's way back to its first key. */
+  /** Time of a loop from its last key back to its first, seconds. */
   closing = 2;
 
   /** Length in seconds. */
@@ -75,7 +75,7 @@ class Path extends EventTarget {
     let i = 0;
     while (i + 1 < n && keys[i + 1].time <= time) i += 1;
     if (!this.loop) i = Math.min(i, n - 2);
-    // Key j with its time, beyond the ends around the loop, or the last one again.
+    // Key j with its time; beyond the ends it continues around the loop, or repeats the end.
     const key = (/** @type {number} */ j) => {
       if (!this.loop) {
         const kept = clamp(j, 0, n - 1);
@@ -104,12 +104,12 @@ class Path extends EventTarget {
       return multiply(q, exp([-(a[0] + b[0]) / 4, -(a[1] + b[1]) / 4, -(a[2] + b[2]) / 4]));
     };
     const rotation = slerp(slerp(q1, q2, t), slerp(inner(q0, q1, q2), inner(q1, q2, q3), t), 2 * t * (1 - t));
-    // A spline that goes beyond its ends would turn pictures over.
+    // A spline that overshoots could turn pictures upside down.
     const fov = clamp(spline(k0.fov, k1.fov, k2.fov, k3.fov), Math.min(k1.fov, k2.fov), Math.max(k1.fov, k2.fov));
     return { position, rotation, fov };
   }
 
-  /** As it is saved and read by irradia render --path. */
+  /** The format that is saved, and read by irradia render --path. */
   toJSON() {
     return { irradia_path: 1, fps: this.fps, loop: this.loop, ease: this.ease, closing: this.closing, keys: this.keys };
   }
@@ -119,7 +119,7 @@ class Path extends EventTarget {
     const fits = (/** @type {any} */ key) =>
       [key?.time, key?.fov, ...(key?.position ?? [null]), ...(key?.rotation ?? [null])].every(Number.isFinite) &&
       key.position.length === 3 && key.rotation.length === 4;
-    if (saved?.irradia_path !== 1 || !Array.isArray(saved.keys) || !saved.keys.every(fits)) throw new Error("This is no camera path of Irradia");
+    if (saved?.irradia_path !== 1 || !Array.isArray(saved.keys) || !saved.keys.every(fits)) throw new Error("This is not a camera path of Irradia");
     this.keys = saved.keys.map((/** @type {Key} */ { time, position, rotation, fov }) => ({ time, position, rotation, fov }));
     this.keys.sort((a, b) => a.time - b.time);
     [this.fps, this.loop, this.ease, this.closing] = [saved.fps ?? 30, Boolean(saved.loop), Boolean(saved.ease), saved.closing ?? 2];

@@ -1,4 +1,4 @@
-// The address that holds the camera: everything after the # sign.
+// The camera in the page's address: everything after the # sign.
 
 import { unit } from "./math.js";
 import { state } from "./state.js";
@@ -7,7 +7,7 @@ import { state } from "./state.js";
 
 const compact = (/** @type {readonly number[]} */ values) => values.map((value) => Number(value.toPrecision(7))).join(",");
 
-/** The address of the present view. With a token in it, it lets in whom it is given to. */
+/** The address of the current view. With a token in it, it gives access to whoever receives it. */
 export function shareAddress() {
   const { position, rotation, fov } = state.get("camera");
   const parts = [`p=${compact(position)}`, `q=${compact(rotation)}`, `f=${compact([fov])}`, `o=${compact(state.get("pivot"))}`];
@@ -16,7 +16,7 @@ export function shareAddress() {
   return `${location.origin}${location.pathname}${location.search}#${parts.join("&")}`;
 }
 
-/** What the address holds, as far as it can be read. @returns {Partial<import("./state.js").Values> | null} */
+/** The values in the address, as far as they can be read. @returns {Partial<import("./state.js").Values> | null} */
 export function sharedValues() {
   const given = new URLSearchParams(location.hash.slice(1));
   const numbers = (/** @type {string} */ name, /** @type {number} */ count) => {

@@ -1,4 +1,4 @@
-// The picture, the overlay and the comparison with photographs: <irr-stage>.
+// <irr-stage>: the picture, the overlay and the comparison with photographs.
 
 import { frameOn, intrinsics } from "./camera.js";
 import { connection, pictureOf } from "./connection.js";
@@ -16,38 +16,38 @@ import { state } from "./state.js";
 /** @typedef {import("./camera.js").Intrinsics} Intrinsics */
 /** @typedef {import("./connection.js").Header} Header */
 
-/** Modes that the page can draw itself. */
+/** Modes that the page can draw locally. */
 export const LOCAL_MODES = ["color", "ellipses", "rings", "points"];
-/** Splats beyond which the server draws, unless the user says otherwise. */
+/** Number of splats beyond which the server draws, unless the user chooses otherwise. */
 const MANY = 3e6;
 /** Largest number of device pixels per CSS pixel. */
 const DENSITY = 2;
-/** Pixels of the longer side of a picture, as the server draws at most. */
+/** Maximum side of a picture that the server draws, pixels. */
 const MOST_SIDE = 4096;
 /** Milliseconds between the two pictures of a blink. */
 const BLINK = 700;
 
-/** What lines and layout depend on, beside the camera. @type {(keyof import("./state.js").Values)[]} */
+/** What lines and layout depend on, besides the camera. @type {(keyof import("./state.js").Values)[]} */
 const LINES = ["pivot", "view", "views", "frusta", "axes", "clip", "measured", "metres", "scores", "compare", "tab", "scene", "sidebar",
   "tool", "editing", "region", "transform", "selectMode", "brush", "highlight"];
 
 export class Stage extends HTMLElement {
   /** What is on the screen now. @type {{ camera: Camera, k: Intrinsics, header: Header | null } | null} */
   shown = null;
-  /** Shots on the way, by id. @type {Map<number, { camera: Camera, k: Intrinsics, at: number }>} */
+  /** Requested pictures that have not arrived, by id. @type {Map<number, { camera: Camera, k: Intrinsics, at: number }>} */
   sent = new Map();
   ids = 0;
-  /** Pictures received, and which of them is shown: they may be decoded in another order. */
+  /** Number of pictures received, and which of them is shown: they may be decoded in a different order. */
   received = 0;
   newest = 0;
-  /** Whether another picture is wanted. */
+  /** Whether a new picture is needed. */
   dirty = true;
   /** Whether lines and layout must be renewed. */
   stale = true;
   split = 0.5;
   /** Where the pointer went down. */
   pressed = { x: 0, y: 0 };
-  /** Of the last second. */
+  /** Times of the pictures of the last second. */
   times = /** @type {number[]} */ ([]);
   /** Milliseconds from the change of the camera to the picture, newest last. */
   delays = /** @type {number[]} */ ([]);
@@ -75,8 +75,8 @@ export class Stage extends HTMLElement {
     }
     const touch = () => (this.stale = true);
     for (const key of LINES) state.addEventListener(key, touch);
-    // The lines over a served picture have its camera: its arrival renews them. A canvas renewed 60 times a second costs half a core
-    // where the browser composes without a GPU.
+    // Lines over a served picture use its camera, so that its arrival renews them. A canvas renewed 60 times a second costs half a core
+    // if the browser composes without a GPU.
     state.addEventListener("camera", () => (this.stale ||= this.drawsLocally));
     for (const source of [this, path, thumbnails, pointer]) for (const kind of ["drawing", "change", "load"]) source.addEventListener(kind, touch);
     state.addEventListener("scene", () => local.load(state.get("scene")));
@@ -119,7 +119,7 @@ export class Stage extends HTMLElement {
     this.dirty = this.stale = true;
   }
 
-  /** Whether this page draws. */
+  /** Whether this page draws locally. */
   get drawsLocally() {
     const scene = state.get("scene");
     if (!scene?.travels || !LOCAL_MODES.includes(state.get("mode")) || state.get("compare") === "error") return false;
@@ -129,7 +129,7 @@ export class Stage extends HTMLElement {
     return this.local.accelerated && scene.count <= MANY && !state.get("hello")?.live;
   }
 
-  /** The view in whose light the scene is shown: beside a photograph that one's. @returns {number | null} */
+  /** The view in whose light the scene is shown: that of the photograph it is compared with, if any. @returns {number | null} */
   get light() {
     if (!state.get("scene")?.lights) return null;
     const compares = state.get("compare") !== "none" && state.insideView?.trained;
@@ -141,7 +141,7 @@ export class Stage extends HTMLElement {
     return frameOn(Math.max(this.clientWidth, 1), Math.max(this.clientHeight, 1), state.insideView);
   }
 
-  /** The request for the present picture. */
+  /** The request for the current picture. */
   shot() {
     const camera = state.get("camera");
     const rect = this.frameRect;
@@ -162,13 +162,13 @@ export class Stage extends HTMLElement {
     };
   }
 
-  /** The camera of the present shot. */
+  /** The camera of the current request. */
   get wanted() {
     const { width, height, fx, fy, cx, cy } = this.shot();
     return { camera: state.get("camera"), k: { width, height, fx, fy, cx, cy } };
   }
 
-  /** What is on the screen: over a served picture its own camera, so that lines and picture move together.
+  /** The camera on the screen: for a served picture its own, so that lines and picture move together.
    * @returns {{ camera: Camera, k: Intrinsics } | null} */
   get seen() {
     if (!this.drawsLocally) return this.shown;
@@ -217,7 +217,7 @@ export class Stage extends HTMLElement {
     const style = { left: `${rect.left}px`, top: `${rect.top}px`, width: `${rect.width}px`, height: `${rect.height}px` };
     for (const element of [this.drawn, this.photo]) if (element) Object.assign(element.style, style);
     if (this.served) {
-      // Until a picture of the stage's new size is here, the old one keeps its proportions; the vertical field of view stays.
+      // Until a picture of the stage's new size arrives, the old one keeps its proportions; the vertical field of view stays the same.
       const k = this.shown?.header ? this.shown.k : rect;
       const width = (rect.height * k.width) / k.height;
       Object.assign(this.served.style, style, { left: `${rect.left + (rect.width - width) / 2}px`, width: `${width}px` });

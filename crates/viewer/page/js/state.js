@@ -4,7 +4,7 @@
 /** @typedef {import("./camera.js").View} View */
 /** @typedef {import("./math.js").Vec3} Vec3 */
 
-/** What the server says of the scene.
+/** What the server tells about the scene.
  * @typedef {{ version: number, step: number | null, kind: string, count: number, sh_degree: number, travels: boolean, lights: boolean,
  *   placement: import("./edit/placement.js").Placement, world: { scale: number, center: Vec3 }, antialias: boolean, background: Vec3, center: Vec3, up: Vec3, radius: number, height: number, fov: number }} Scene */
 
@@ -48,7 +48,7 @@
  * @property {string | null} problem
  */
 
-/** Values that are kept from visit to visit. */
+/** Values that are saved between visits. */
 const KEPT = ["drawing", "navigation", "frusta", "axes", "sidebar", "tab", "theme", "speed", "brush", "visibleOnly"];
 const STORE = "irradia-viewer";
 
@@ -68,7 +68,7 @@ class State extends EventTarget {
       for (const key of KEPT) if (key in kept) Object.assign(this.values, { [key]: kept[key] });
       if (innerWidth <= 720) this.values.sidebar = false;
     } catch {
-      // Without a store, or with one of another version, the page begins afresh.
+      // Without stored values, or with those of another version, the page uses its defaults.
     }
   }
 
@@ -77,7 +77,7 @@ class State extends EventTarget {
     return this.values[key];
   }
 
-  /** Changes values, then announces each by its name. @param {Partial<Values>} changes */
+  /** Changes values, then dispatches an event named after each. @param {Partial<Values>} changes */
   set(changes) {
     const changed = /** @type {(keyof Values)[]} */ (Object.keys(changes)).filter((key) => this.values[key] !== changes[key]);
     Object.assign(this.values, changes);
@@ -96,7 +96,7 @@ class State extends EventTarget {
       const values = /** @type {any} */ (this.values);
       localStorage.setItem(STORE, JSON.stringify(Object.fromEntries(KEPT.map((key) => [key, values[key]]))));
     } catch {
-      // A private window may have no store.
+      // A private window may have no storage.
     }
   }
 

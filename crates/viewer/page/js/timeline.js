@@ -1,4 +1,4 @@
-// <irr-timeline>: the camera path over time, its preview.
+// <irr-timeline>: the key frames of the camera path over time, and its preview.
 
 import { clock, el } from "./dom.js";
 import { icon } from "./icons.js";
@@ -35,7 +35,7 @@ class Timeline extends HTMLElement {
       mark.addEventListener("pointerdown", (event) => event.stopPropagation());
       mark.addEventListener("keydown", (event) => {
         if (event.key !== "Delete" && event.key !== "Backspace") return;
-        // The selection stays.
+        // Otherwise the key would delete the selection.
         event.stopPropagation();
         event.preventDefault();
         path.keys.splice(index, 1);

@@ -1,4 +1,4 @@
-// <irr-toolbar>: what is drawn, how one moves, and the page's buttons.
+// <irr-toolbar>: what is drawn, the kind of navigation, and the page's buttons.
 
 import { COMMANDS, MODES, SPLAT_MODES, share, stage, toggleTheme } from "./commands.js";
 import { choose, el, press, segments, short } from "./dom.js";
@@ -12,9 +12,9 @@ class Toolbar extends HTMLElement {
     const modes = el("select", { "aria-label": "What is drawn", title: "What is drawn (1 to 8)" });
     for (const [value, name] of MODES) modes.append(el("option", { value, textContent: name }));
     modes.onchange = () => state.set({ mode: modes.value });
-    const ways = segments("How one moves", [["orbit", "Orbit", "Turn about the pivot (O)"], ["fly", "Fly", "W A S D Q E and drag (F)"], ["walk", "Walk", "Fly at one height (G)"]],
+    const ways = segments("Navigation", [["orbit", "Orbit", "Turn about the pivot (O)"], ["fly", "Fly", "W A S D Q E and drag (F)"], ["walk", "Walk", "Fly at a constant height (G)"]],
       (navigation) => state.set({ navigation: /** @type {any} */ (navigation) }));
-    const drawing = el("select", { "aria-label": "Where it is drawn", title: "Where it is drawn (L)" },
+    const drawing = el("select", { "aria-label": "Where the picture is drawn", title: "Where the picture is drawn (L)" },
       el("option", { value: "auto", textContent: "Draw: auto" }), el("option", { value: "served", textContent: "On the server" }), el("option", { value: "local", textContent: "In this browser" }));
     drawing.onchange = () => state.set({ drawing: /** @type {any} */ (drawing.value) });
 
@@ -30,8 +30,8 @@ class Toolbar extends HTMLElement {
       el("span", { className: "divider" }), measure, inspect, frusta,
       button("home", "Home (H)", () => stage().navigation?.home()),
       el("span", { className: "divider" }), wide(drawing), vr,
-      button("share", "Share this view: copies an address that holds the camera (U)", share),
-      button("theme", "Dark or light (T)", toggleTheme),
+      button("share", "Share this view: copies an address that contains the camera (U)", share),
+      button("theme", "Dark or light theme (T)", toggleTheme),
       button("help", "Keys (?)", () => document.querySelector("irr-help")?.dispatchEvent(new Event("open"))), panel,
     );
 
@@ -60,7 +60,7 @@ function button(name, label, onclick) {
   return el("button", { type: "button", className: "icon", title: label, "aria-label": label, onclick }, icon(name));
 }
 
-/** @param {HTMLElement} element left out where there is little room */
+/** @param {HTMLElement} element hidden on narrow screens */
 function wide(element) {
   element.classList.add("wide");
   return element;

@@ -1,10 +1,10 @@
-// Virtual reality where the browser offers it, drawn by this page. Tested without a headset only, with a session made up: that the button appears where one
-// is offered, and that both eyes see the scene (page-tests/tests/xr.test.js).
+// Virtual reality, if the browser offers it, drawn by this page. Tested without a headset, with a simulated session: the button appears if
+// a session is offered, and both eyes see the scene (page-tests/tests/xr.test.js).
 
 import { axes, fromAxes } from "./math.js";
 import { state } from "./state.js";
 
-/** WebXR as far as it is used. @typedef {any} Xr */
+/** The parts of WebXR that are used. @typedef {any} Xr */
 
 /** @returns {Promise<boolean>} */
 export async function offersXr() {
@@ -18,7 +18,7 @@ export async function offersXr() {
 /** @param {import("./stage.js").Stage} stage */
 export async function enterXr(stage) {
   const { local } = stage;
-  // Headsets show what WebGL2 draws.
+  // Only WebGL2 draws for headsets.
   const gl = local?.holdWebGl(true)?.gl;
   if (!local || !gl || !state.get("scene")?.travels) {
     local?.holdWebGl(false);
@@ -32,7 +32,7 @@ export async function enterXr(stage) {
     session.updateRenderState({ baseLayer: layer });
     const space = await session.requestReferenceSpace("local");
     const start = state.get("camera");
-    // One metre is a sixth of the scene's radius where its scale is unknown.
+    // If the scale is unknown, one metre is a sixth of the scene's radius.
     const metre = 1 / (state.get("metres") ?? 6 / (state.get("scene")?.radius ?? 6));
     const frame = (/** @type {number} */ _now, /** @type {Xr} */ now) => {
       session.requestAnimationFrame(frame);
@@ -53,7 +53,7 @@ export async function enterXr(stage) {
     });
   } catch (error) {
     local.holdWebGl(false);
-    state.set({ problem: `VR cannot begin: ${error}` });
+    state.set({ problem: `VR cannot start: ${error}` });
   }
 }
 

@@ -1,4 +1,4 @@
-// The planes of a frame to the canvas: one triangle over everything.
+// Copies the planes of a frame to the canvas: one triangle over everything.
 @group(0) @binding(0) var<uniform> size: vec2u; // pixels
 @group(0) @binding(1) var<storage, read> frame: array<f32>; // planes: red, green, blue, ..
 

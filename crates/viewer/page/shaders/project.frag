@@ -1,5 +1,5 @@
 #version 300 es
-// From a 3D Gaussian to its footprint: EWA splatting (Zwicker et al. 2001) as 3DGS uses it (Kerbl et al. 2023), the twin of
+// Projects a 3D Gaussian to its footprint: EWA splatting (Zwicker et al. 2001) as 3DGS uses it (Kerbl et al. 2023), the twin of
 // crates/splat/src/render/project.rs. Reads the compact splats of crates/viewer/src/compact.rs.
 precision highp float;
 precision highp int;
@@ -15,7 +15,7 @@ uniform mat3 u_rotation; // camera from world
 uniform vec3 u_position; // camera, world
 uniform vec2 u_focal; // pixels
 uniform vec2 u_principal;
-uniform vec4 u_limits; // least x/z, largest x/z, least y/z, largest y/z
+uniform vec4 u_limits; // smallest x/z, largest x/z, smallest y/z, largest y/z
 uniform float u_near;
 uniform bool u_antialias;
 uniform vec3 u_low; // clipping box, world
@@ -29,7 +29,7 @@ const vec3 SELECTED = vec3(1.0, 0.72, 0.0); // as in crates/viewer/src/palette.r
 const float SELECTED_SHARE = 0.6;
 const float C1 = 0.4886025119029199;
 
-// The 16, 32 or 48 bytes of a splat's higher bands, fetched once: a fetch for each byte takes a third longer.
+// The 16, 32 or 48 bytes of a splat's higher bands, fetched once: one fetch per byte takes a third longer.
 uvec4 bands[3];
 
 uint byteAt(int n) {
@@ -106,7 +106,7 @@ void main() {
     2.0 * (i * k + w * j), 2.0 * (j * k - w * i), 1.0 - 2.0 * (i * i + j * j));
   vec2 tangent = clamp(x.xy / x.z, u_limits.xz, u_limits.yw);
   mat3 m = u_rotation * rot;
-  // Rows of J times the camera's axes of the splat, times its standard deviations.
+  // Rows of J times the splat's axes in the camera, times its standard deviations.
   vec3 row2 = vec3(m[0].z, m[1].z, m[2].z);
   vec3 v0 = u_focal.x / x.z * (vec3(m[0].x, m[1].x, m[2].x) - tangent.x * row2) * scale;
   vec3 v1 = u_focal.y / x.z * (vec3(m[0].y, m[1].y, m[2].y) - tangent.y * row2) * scale;

@@ -1,5 +1,5 @@
 #version 300 es
-// A fragment of a splat drawn as an ellipse, a ring or a point; apart from splat.frag, whose cost is that of the picture.
+// A fragment of a splat drawn as an ellipse, a ring or a point. Separate from splat.frag, which dominates the cost of a picture.
 precision highp float;
 precision highp int;
 

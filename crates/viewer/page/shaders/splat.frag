@@ -1,5 +1,5 @@
 #version 300 es
-// A fragment of a splat, with the thresholds of crates/splat/src/render/blend.rs; colour is multiplied by alpha.
+// A fragment of a splat, with the thresholds of crates/splat/src/render/blend.rs. Colours are premultiplied by alpha.
 precision highp float;
 precision highp int;
 

@@ -1,10 +1,10 @@
 #version 300 es
-// A quad around each splat's ellipse, as far as its alpha reaches 1/255.
+// A quad around the ellipse of each splat in which alpha is at least 1/255.
 precision highp float;
 precision highp int;
 precision highp usampler2D;
 
-const int BATCH = 128; // splats an instance, as in js/local/renderer.js
+const int BATCH = 128; // splats per instance, as in js/local/webgl.js
 uniform usampler2D u_order; // [rows, 1024]
 uniform int u_drawn;
 uniform usampler2D u_place;

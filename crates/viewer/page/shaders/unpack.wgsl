@@ -1,5 +1,5 @@
-// Compact splats, as crates/viewer/src/compact.rs has them, to the planes of crates/splat/src/gpu/shaders/project.wgsl. Selected ones
-// are tinted; those outside of the clipping box become invisible.
+// Unpacks compact splats, in the format of crates/viewer/src/compact.rs, to the planes of crates/splat/src/gpu/shaders/project.wgsl.
+// Selected splats are tinted; those outside the clipping box become invisible.
 struct Params {
     low: vec3f, // clipping box, world
     first: u32,
@@ -8,12 +8,12 @@ struct Params {
     stride: u32, // of a plane
     degree: u32,
     highlight: u32, // whether selected splats are tinted
-    start: u32, // in cores and bands: of the scene, or of a level of detail
+    start: u32, // first splat in cores and bands: of the scene, or of a level of detail
 }
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<storage, read> cores: array<vec4u>; // [splat, 2]
 @group(0) @binding(2) var<storage, read> bands: array<vec4u>; // [splat, degree]
-@group(0) @binding(3) var<storage, read> selected: array<u32>; // a bit each
+@group(0) @binding(3) var<storage, read> selected: array<u32>; // one bit per splat
 @group(0) @binding(4) var<storage, read_write> geometry: array<f32>;
 @group(0) @binding(5) var<storage, read_write> harmonics: array<f32>;
 

@@ -1,5 +1,5 @@
-//! Editing from the pages: one session on a finished scene of splats, which all pages share. What they ask for waits in a queue; a
-//! thread of its own does it, shows the scene that results and tells every page.
+//! Editing from the pages: one session on a finished scene of splats, which all pages share. Their requests wait in a queue; a
+//! separate thread carries them out, shows the resulting scene and informs every page.
 
 mod save;
 mod session;
@@ -23,7 +23,7 @@ use uploads::Uploads;
 pub(crate) use work::work;
 pub(crate) use world::placed;
 
-/// Requests that wait.
+/// Maximum number of waiting requests.
 const WAITING: usize = 64;
 
 /// Why a request of a page is not fulfilled.
@@ -41,7 +41,7 @@ struct Queue {
     closing: bool,
 }
 
-/// The scene as it is edited, and the list of edits.
+/// The edited scene and its list of edits.
 type Current = (Arc<Draft>, Arc<EditList>);
 
 pub(crate) struct Editing {
@@ -51,7 +51,7 @@ pub(crate) struct Editing {
     pub uploads: Arc<Uploads>,
     queue: Mutex<Queue>,
     asked: Condvar,
-    /// What the pages are told.
+    /// The state that pages are told.
     told: watch::Sender<Arc<Value>>,
     /// `None` before the first request.
     current: Mutex<Option<Current>>,
@@ -62,7 +62,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Editing {
-    /// Of the scene in the file `source`, which has so many splats.
+    /// A session on the scene in the file `source`, which has `splats` splats.
     pub fn new(source: PathBuf, splats: usize) -> Self {
         Self {
             uploads: Arc::new(Uploads::new(folder_of(&source))),
@@ -74,7 +74,7 @@ impl Editing {
         }
     }
 
-    /// What the pages are told, now and at every change.
+    /// The state that pages are told, now and at every change.
     pub fn watch(&self) -> watch::Receiver<Arc<Value>> {
         self.told.subscribe()
     }
@@ -83,7 +83,7 @@ impl Editing {
         self.told.send_replace(Arc::new(told));
     }
 
-    /// Adds a request of a page, in place of a waiting one of the same gesture. Whether there was room.
+    /// Adds a request of a page, replacing a waiting one of the same gesture. Returns whether there was room.
     pub fn ask(&self, seat: u64, request: EditRequest) -> bool {
         let mut queue = lock(&self.queue);
         let last = queue.waiting.back().and_then(|(_, last)| last.gesture());
@@ -129,7 +129,7 @@ impl Editing {
     /// The splats to write.
     ///
     /// # Errors
-    /// When nothing has been edited, and the file of the scene cannot be read any more.
+    /// When nothing has been edited, and the file of the scene can no longer be read.
     pub fn cloud(&self) -> Result<GaussianCloud, FormatError> {
         match self.current() {
             Some((draft, _)) => Ok(draft.shown().into_owned()),

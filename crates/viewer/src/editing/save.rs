@@ -17,7 +17,7 @@ pub(super) struct Saved {
 }
 
 impl Saved {
-    /// In words.
+    /// A line that names the files.
     pub fn line(&self) -> String {
         let name = |path: &Path| {
             path.file_name()
@@ -41,12 +41,12 @@ fn entry_of(source: &Path) -> &Path {
     }
 }
 
-/// Where a scene's file, or its folder of images, is.
+/// The folder that contains a scene's file or its folder of images.
 pub(super) fn folder_of(source: &Path) -> &Path {
     entry_of(source).parent().unwrap_or(Path::new(""))
 }
 
-/// The name of a scene's file without its format; of a folder of images that of the folder.
+/// The name of a scene's file, or of its folder of images, without the extension.
 pub(crate) fn stem_of(source: &Path) -> String {
     let name = entry_of(source)
         .file_name()
@@ -60,7 +60,8 @@ pub(crate) fn stem_of(source: &Path) -> String {
     }
 }
 
-/// Writes the list, the scene, the scenes that were split off and those that pages sent to be merged; to the same files as before if the session was saved.
+/// Writes the list, the scene, the scenes that were split off and those that pages sent to be merged; to the same files as before if the
+/// session has been saved.
 pub(super) fn save(session: &Session, source: &Path, before: Option<&Saved>) -> Result<Saved, EditingError> {
     let stem = stem_of(source);
     let folder = folder_of(source);
@@ -70,7 +71,7 @@ pub(super) fn save(session: &Session, source: &Path, before: Option<&Saved>) -> 
         } else {
             format!("-{number}")
         };
-        // A run's own `edits.toml` is of its scene, edited in place.
+        // Not `edits.toml`: in a run, that is the list of edits made to its scene in place.
         let list = format!("{stem}.edits{end}.toml");
         (folder.join(list), folder.join(format!("{stem}.edited{end}.ply")))
     };
@@ -88,7 +89,7 @@ pub(super) fn save(session: &Session, source: &Path, before: Option<&Saved>) -> 
         write_splats(&path_of(name), part)?;
     }
     let parts: Vec<PathBuf> = parts.iter().map(|(name, _)| path_of(name)).collect();
-    // Of splits that were undone since.
+    // Parts of splits that have been undone since are removed.
     for old in before.iter().flat_map(|before| &before.parts) {
         if !parts.contains(old) && old.exists() {
             fs::remove_file(old).map_err(|source| FormatError::Write {
@@ -108,7 +109,7 @@ pub(super) fn save(session: &Session, source: &Path, before: Option<&Saved>) -> 
     })
 }
 
-/// Writes the list of a session that ends, if it has edits that were not saved, as a new file beside the scene's; returns that.
+/// Writes the list of a session that ends to a new file beside the scene's, if it has unsaved edits; returns the path of the file.
 pub(super) fn save_rest(
     session: &Session,
     source: &Path,

@@ -1,4 +1,4 @@
-//! A scene with a list of what was done to it: selections and edits, of which the first are made.
+//! A scene with the list of its selections and edits; those after the current position are undone.
 
 use super::EditingError;
 use super::uploads::Uploads;
@@ -10,14 +10,14 @@ use irradia_edit::{
 use irradia_scene::{GaussianCloud, Similarity};
 use std::sync::Arc;
 
-/// Bytes of earlier states that are kept, so that an undo is at once; beyond them it makes the edits again.
+/// Maximum bytes of earlier states that are kept for an immediate undo; without a kept state, undo makes the edits again.
 const KEPT_BYTES: usize = 1 << 30;
-/// Entries of the list. A selection may take 60 kB.
+/// Maximum number of entries in the list. A selection may take 60 kB.
 const MOST_ENTRIES: usize = 20_000;
-/// Numbers of all selections in the list.
+/// Maximum count of numbers in all selections of the list.
 const MOST_POINTS: usize = 8_000_000;
 
-/// What was done.
+/// The action of an entry.
 #[derive(Clone, Debug)]
 enum Deed {
     Select {
@@ -25,7 +25,7 @@ enum Deed {
         replace: bool,
     },
     Deselect,
-    /// An edit with everything that was found written out, and how it moved the whole scene.
+    /// An edit with everything that was found automatically spelled out, and how it moved the whole scene.
     Edit(Edit, Option<Transform>),
 }
 
@@ -45,28 +45,28 @@ struct Kept {
 
 pub(crate) struct Session {
     entries: Vec<Entry>,
-    /// Number of entries that are made.
+    /// The current position: number of entries that are made.
     at: usize,
     draft: Arc<Draft>,
     /// The scene as it was opened, then newer states, oldest first.
     kept: Vec<Kept>,
-    /// How the present selection came about.
+    /// The steps of the current selection.
     steps: Vec<SelectStep>,
     selected: Arc<Selection>,
-    /// How much each splat of a state is a floater.
+    /// The floater score of each splat of a state.
     scores: Option<(Arc<Draft>, Vec<f32>)>,
     /// Scenes to merge.
     uploads: Arc<Uploads>,
 }
 
-/// An entry as pages list it.
+/// An entry in the form that pages list.
 pub(crate) struct Listed<'a> {
     pub is_edit: bool,
     pub text: &'a str,
 }
 
 impl Session {
-    /// Nothing done to a scene, with which `uploads` can be merged.
+    /// A session without entries on a scene with which `uploads` can be merged.
     pub fn new(draft: Draft, uploads: Arc<Uploads>) -> Self {
         let draft = Arc::new(draft);
         Self {
@@ -93,7 +93,7 @@ impl Session {
         &self.kept[0].draft
     }
 
-    /// Of [`Self::draft`].
+    /// The selected splats of [`Self::draft`].
     pub fn selected(&self) -> &Arc<Selection> {
         &self.selected
     }
@@ -103,7 +103,7 @@ impl Session {
         self.at
     }
 
-    /// All entries, those undone included.
+    /// All entries, including those undone.
     pub fn entries(&self) -> impl ExactSizeIterator<Item = Listed<'_>> {
         self.entries.iter().map(|entry| Listed {
             is_edit: matches!(entry.deed, Deed::Edit(..)),
@@ -131,7 +131,7 @@ impl Session {
         }
     }
 
-    /// From the world of the scene as it was opened to the present one.
+    /// From the world of the scene as it was opened to the current one.
     pub fn placement(&self) -> Transform {
         let moved = self.entries[..self.at].iter().filter_map(|entry| match &entry.deed {
             Deed::Edit(_, moved) => moved.as_ref(),
@@ -156,7 +156,7 @@ impl Session {
         self.in_place_of(gesture, |session| {
             let before = if replace { Vec::new() } else { session.steps.clone() };
             if before.is_empty() && steps.first().is_none_or(|step| step.mode != Mode::Add) {
-                return Err(EditError::Selection("nothing is selected to take away from".to_owned()));
+                return Err(EditError::Selection("nothing is selected to subtract from".to_owned()));
             }
             let all = [&before[..], &steps].concat();
             let selected = session.evaluate(&all, before.len())?;
@@ -167,7 +167,7 @@ impl Session {
         })
     }
 
-    /// What `steps` select, of which the first `known` give the present selection.
+    /// What `steps` select; the first `known` of them give the current selection.
     fn evaluate(&mut self, steps: &[SelectStep], known: usize) -> Result<Selection, EditError> {
         let is_simple = |step: &SelectStep| {
             !matches!(
@@ -178,7 +178,7 @@ impl Session {
         if !steps[known..].iter().all(is_simple) {
             return select(&self.draft, steps);
         }
-        // A hundred strokes of a brush are not evaluated again for each further one.
+        // Starts from the current selection, so that a hundred brush strokes are not evaluated again for each further one.
         let mut selected = match known {
             0 => Selection::none(self.draft.len()),
             _ => (*self.selected).clone(),
@@ -199,7 +199,7 @@ impl Session {
         let Shape::Floaters { score } = shape else {
             return select(&self.draft, &[SelectStep::add(shape.clone())]);
         };
-        // A slider of the least score asks for the same scores, which take seconds.
+        // A slider for the minimum score needs the same scores again, which take seconds.
         let kept = self.scores.take().filter(|(draft, _)| Arc::ptr_eq(draft, &self.draft));
         let (draft, scores) = kept.unwrap_or_else(|| {
             let scores = floater_scores(&self.draft);
@@ -283,13 +283,13 @@ impl Session {
             })
             .sum();
         if self.entries.len() >= MOST_ENTRIES || all + points(steps) > MOST_POINTS {
-            let message = "the list of edits is full: save the scene and open what was saved";
+            let message = "the list of edits is full: save the scene and open the saved one";
             return Err(EditError::Scene(message.to_owned()));
         }
         Ok(())
     }
 
-    /// Does `next` instead of the last entry if that is of the same gesture; if it fails, the last entry stays.
+    /// Runs `next` in place of the last entry if that is of the same gesture; if it fails, the last entry stays.
     fn in_place_of(
         &mut self,
         gesture: u64,
@@ -315,7 +315,7 @@ impl Session {
         self.at += 1;
     }
 
-    /// Sets the state after the present edits, and keeps it.
+    /// Sets the state after the current edits, and keeps it.
     fn set_draft(&mut self, draft: Arc<Draft>) {
         let edits = self.edits().count();
         self.draft = draft.clone();
@@ -354,10 +354,10 @@ impl Session {
         steps
     }
 
-    /// Undoes or makes again until the first `at` entries are made.
+    /// Undoes or redoes entries until the first `at` are made.
     ///
     /// # Errors
-    /// Those of the edits, which have been made before.
+    /// Those of the edits, although these have been made before.
     pub fn go(&mut self, at: usize) -> Result<(), EditError> {
         let at = at.min(self.entries.len());
         let before = self.edits().count();
@@ -396,7 +396,7 @@ impl Session {
     /// The scenes that were split off, with their names.
     ///
     /// # Errors
-    /// Those of the edits, which have been made before.
+    /// Those of the edits, although these have been made before.
     pub fn parts(&self) -> Result<Vec<(String, GaussianCloud)>, EditError> {
         let mut parts = Vec::new();
         let edits: Vec<&Edit> = self.edits().collect();
@@ -414,7 +414,7 @@ impl Session {
     }
 }
 
-/// Whether the splats of a selection are still there to go on with.
+/// Whether the selected splats still exist after the operation, and stay selected.
 fn leaves_selection(op: &Operation) -> bool {
     matches!(
         op,
@@ -428,7 +428,7 @@ fn leaves_selection(op: &Operation) -> bool {
     )
 }
 
-/// Numbers that a step takes.
+/// Count of numbers in a step.
 fn points_of(step: &SelectStep) -> usize {
     match &step.shape {
         Shape::Polygon { points, .. } | Shape::Brush { points, .. } => 16 + 2 * points.len(),
@@ -440,7 +440,7 @@ fn bytes_of(cloud: &GaussianCloud) -> usize {
     4 * cloud.len() * (11 + 3 * cloud.sh_coefficients())
 }
 
-/// A selection in the list.
+/// The text of a selection in the list.
 fn select_text(steps: &[SelectStep], replace: bool) -> String {
     let Some(first) = steps.first() else {
         return String::new();
@@ -477,7 +477,7 @@ fn select_text(steps: &[SelectStep], replace: bool) -> String {
     }
 }
 
-/// An edit of `selected` splats in the list.
+/// The text of an edit of `selected` splats in the list.
 fn edit_text(op: &Operation, selected: usize, before: usize, after: usize) -> String {
     let verb = match op {
         Operation::Delete {} => return format!("Delete {}", before - after),

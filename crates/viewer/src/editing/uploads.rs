@@ -1,4 +1,4 @@
-//! Scenes that pages have sent to be merged. Edits name them, and no other files.
+//! Scenes that pages have sent to be merged. Edits can name these, and no other files.
 
 use super::EditingError;
 use irradia_edit::EditError;
@@ -9,7 +9,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
-/// Bytes of all files that are kept.
+/// Maximum bytes of all files that are kept.
 const MOST_BYTES: usize = 1 << 30;
 
 struct Upload {
@@ -17,7 +17,7 @@ struct Upload {
     cloud: GaussianCloud,
 }
 
-/// What was sent, by its name.
+/// The scenes that were sent, by name.
 pub(crate) struct Uploads {
     /// Where saving writes them.
     folder: PathBuf,
@@ -25,7 +25,7 @@ pub(crate) struct Uploads {
 }
 
 impl Uploads {
-    /// To be written to `folder`.
+    /// No scenes yet; saving writes them to `folder`.
     pub fn new(folder: &Path) -> Self {
         Self {
             folder: folder.to_owned(),
@@ -36,14 +36,14 @@ impl Uploads {
     /// Keeps a file that a page calls `name`. Returns the name by which edits find it, and its number of splats.
     ///
     /// # Errors
-    /// When it is no splat file, or there is no room.
+    /// When it is not a splat file, or there is no room.
     pub fn add(&self, name: &str, bytes: Vec<u8>) -> Result<(String, usize), EditingError> {
         let name: String = name.chars().map(plain).collect();
         let path = PathBuf::from(name.trim_start_matches('.'));
         let format = SplatFormat::of(&path)?;
         if !format.is_readable() || format == SplatFormat::SogFolder {
             return Err(refused(format!(
-                "{name}: cannot be merged in one piece: choose .ply or .sog"
+                "{name}: this format cannot be merged: choose .ply or .sog"
             )));
         }
         let cloud = parse_splats(format, &bytes).map_err(|source| FormatError::Malformed {
@@ -65,7 +65,7 @@ impl Uploads {
         let name = (1..).map(numbered).find(is_free).expect("some number is free");
         if kept + bytes.len() > MOST_BYTES && !files.contains_key(&name) {
             return Err(refused(
-                "there is no room for further scenes: merge them with irradia edit".to_owned(),
+                "there is no room for more scenes: merge them with irradia edit".to_owned(),
             ));
         }
         let splats = cloud.len();
@@ -97,13 +97,13 @@ impl Uploads {
     /// Writes the file `name` to the folder, where `irradia edit` finds it.
     ///
     /// # Errors
-    /// When it cannot be written, or another one of its name has come there.
+    /// When it cannot be written, or another file has taken its name meanwhile.
     pub fn save(&self, name: &str) -> Result<(), EditingError> {
         let files = self.files.lock().unwrap_or_else(PoisonError::into_inner);
         let Some(upload) = files.get(name) else { return Ok(()) };
         if !self.is_free(name, &upload.bytes) {
             return Err(refused(format!(
-                "another {name} has come beside the scene: move it away"
+                "there is another {name} beside the scene now: move it away"
             )));
         }
         let path = self.folder.join(name);
@@ -118,7 +118,7 @@ fn refused(message: String) -> EditingError {
     EditError::Scene(message).into()
 }
 
-/// A character of a file's name that every system takes and no path is made of.
+/// `c`, or an underscore for a character that some systems refuse in file names or that could form a path.
 fn plain(c: char) -> char {
     match c.is_alphanumeric() || "-_.".contains(c) {
         true => c,

@@ -1,4 +1,4 @@
-//! The thread that edits.
+//! The editing thread.
 
 use super::save::{Saved, save, save_rest};
 use super::session::Session;
@@ -12,10 +12,10 @@ use irradia_splat::{RenderOptions, Splats};
 use serde_json::{Value, json};
 use std::sync::Arc;
 
-/// Entries of the list that pages are told: those around the last one made.
+/// Maximum number of entries of the list that pages are told: those around the current position.
 const LISTED: usize = 120;
 
-/// A session and what is shown of it.
+/// A session, and what is shown of it.
 struct Bench {
     session: Session,
     options: RenderOptions,
@@ -28,7 +28,7 @@ struct Bench {
     masks: u64,
 }
 
-/// What pages are told of a scene of so many splats that nobody has edited.
+/// The state that pages are told of a scene of `splats` splats before the first request.
 pub(super) fn untouched(splats: usize) -> Value {
     json!({
         "tell": "editing", "selected": 0, "of": splats, "hidden": 0, "locked": 0, "box": null, "at": 0, "first": 0, "total": 0,
@@ -36,7 +36,8 @@ pub(super) fn untouched(splats: usize) -> Value {
     })
 }
 
-/// Does what pages ask for until it closes. `tell` gives a page a line, `wake` wakes who draws. Returns what became of edits that were not saved.
+/// Carries out the requests of pages until `editing` closes. `tell` sends a line to a page, `wake` wakes the drawing thread. Returns a line
+/// about unsaved edits, if there are any.
 pub(crate) fn work(editing: &Editing, subject: &Subject, tell: &dyn Fn(u64, &str), wake: &dyn Fn()) -> Option<String> {
     let mut bench: Option<Bench> = None;
     while let Some((seat, request)) = editing.next() {
@@ -64,10 +65,10 @@ pub(crate) fn work(editing: &Editing, subject: &Subject, tell: &dyn Fn(u64, &str
     let Bench { session, saved, .. } = bench.as_ref()?;
     match save_rest(session, &editing.source, saved.as_ref()) {
         Ok(path) => Some(format!(
-            "edits that were not saved are in {}: Open edits makes them again",
+            "unsaved edits are in {}: use Open edits to make them again",
             path?.display()
         )),
-        Err(error) => Some(format!("edits that were not saved are lost: {error}")),
+        Err(error) => Some(format!("unsaved edits are lost: {error}")),
     }
 }
 
@@ -93,13 +94,13 @@ impl Bench {
         })
     }
 
-    /// Does one thing; returns a line for the page that asked for it.
+    /// Carries out a request; returns a line for the page that sent it.
     fn answer(&mut self, editing: &Editing, request: &EditRequest) -> Result<Option<String>, EditingError> {
         let session = &mut self.session;
         if self.before && !matches!(request, EditRequest::Compare { .. } | EditRequest::Save) {
-            // What was drawn on the scene as it was may be elsewhere now.
+            // A selection drawn on the scene as it was opened may not fit the edited scene.
             self.before = false;
-            return Ok(Some("the scene is shown as it is now: try again".to_owned()));
+            return Ok(Some("the edited scene is shown again: try again".to_owned()));
         }
         match request.clone() {
             EditRequest::Select {
@@ -124,7 +125,7 @@ impl Bench {
         Ok(None)
     }
 
-    /// Draws from now on what the session has come to.
+    /// Shows the current state of the session.
     fn show(&mut self, subject: &Subject) {
         let session = &self.session;
         let (draft, selected, placement) = match self.before {
@@ -156,7 +157,7 @@ impl Bench {
         self.shown = Some((draft.clone(), selected));
     }
 
-    /// What pages are told.
+    /// The state that pages are told.
     fn to_json(&self) -> Value {
         let session = &self.session;
         let (draft, selected) = (session.draft(), session.selected());
@@ -188,8 +189,8 @@ impl Bench {
     }
 }
 
-/// The corners of a box around the centres of the selected splats, world. Along each axis the outermost hundredth is left out: what a
-/// lasso catches in the far background would make the box say nothing.
+/// The corners of a box around the centres of the selected splats, world. Along each axis the outermost hundredth on either side is left
+/// out: what a lasso catches in the far background would make the box useless.
 fn box_around(draft: &Draft, selected: &Selection) -> Option<[[f32; 3]; 2]> {
     let means = draft.cloud.means.iter().zip(selected.as_slice());
     let means: Vec<[f32; 3]> = means

@@ -1,10 +1,10 @@
-//! From the world in which the pages work to the dataset's coordinates, in which lists of edits are.
+//! Conversion from the world, in which pages work, to the dataset's coordinates, in which lists of edits are.
 
 use glam::{DQuat, DVec3};
 use irradia_edit::{Operation, SelectStep, Shape, Transform};
 use irradia_scene::{Camera, Similarity};
 
-/// Positions and lengths of a step, given in the world, in the dataset's coordinates.
+/// Converts the positions and lengths of a step from the world to the dataset's coordinates.
 pub(crate) fn step_to_dataset(step: &mut SelectStep, world: &Similarity) {
     let point = |p: &mut [f64; 3]| *p = world.invert(DVec3::from(*p)).to_array();
     let length = |v: &mut f64| *v /= world.scale;
@@ -26,7 +26,7 @@ pub(crate) fn step_to_dataset(step: &mut SelectStep, world: &Similarity) {
     }
 }
 
-/// Positions and lengths of an operation, given in the world, in the dataset's coordinates.
+/// Converts the positions and lengths of an operation from the world to the dataset's coordinates.
 pub(crate) fn operation_to_dataset(op: &mut Operation, world: &Similarity) {
     let point = |p: &mut [f64; 3]| *p = world.invert(DVec3::from(*p)).to_array();
     match op {
@@ -38,7 +38,7 @@ pub(crate) fn operation_to_dataset(op: &mut Operation, world: &Similarity) {
     }
 }
 
-/// How what stands in the world `from` is placed in the world `to`, after the scene was moved by `moved` in the dataset's coordinates.
+/// The transform of the scene from the world `from` to the world `to`, after it was moved by `moved` in the dataset's coordinates.
 pub(crate) fn placement(from: &Similarity, moved: &Transform, to: &Similarity) -> Transform {
     // to (k R (x / s + c) + t - c')
     Transform {

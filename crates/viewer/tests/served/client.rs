@@ -1,4 +1,4 @@
-//! A page as bytes on a socket.
+//! A page, simulated by bytes on a socket.
 
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
@@ -27,7 +27,7 @@ pub fn address_of(printed: &str) -> SocketAddr {
 pub struct Socket(pub TcpStream);
 
 impl Socket {
-    /// After its handshake.
+    /// Connects and completes the handshake.
     pub fn open(address: SocketAddr) -> Self {
         let mut stream = connect(address);
         let request = format!(
@@ -45,7 +45,7 @@ impl Socket {
         Self(stream)
     }
 
-    /// Sends a masked frame; whether the connection still stood.
+    /// Sends a masked frame; returns whether the connection was still open.
     pub fn send(&mut self, opcode: u8, payload: &[u8]) -> bool {
         let mut frame = vec![0x80 | opcode];
         match payload.len() {

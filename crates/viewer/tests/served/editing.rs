@@ -1,4 +1,4 @@
-//! Editing by pages: what they may ask for, and what they may not.
+//! Editing by pages: which requests are carried out, and which are refused.
 
 use crate::client::Socket;
 use crate::security::{Served, serve};
@@ -31,7 +31,7 @@ fn ask(page: &mut Socket, request: &Value) {
     assert!(page.send(1, request.to_string().as_bytes()));
 }
 
-/// The session when `key` has come to `value` after a request.
+/// Sends a request; returns the state of the session once `key` has the value `value`.
 fn after(page: &mut Socket, request: &Value, (key, value): (&str, Value)) -> Value {
     ask(page, request);
     loop {
@@ -42,7 +42,7 @@ fn after(page: &mut Socket, request: &Value, (key, value): (&str, Value)) -> Val
     }
 }
 
-/// Why a request is refused.
+/// Sends a request; returns why it is refused.
 fn refusal(page: &mut Socket, request: &Value) -> String {
     ask(page, request);
     told(page, "problem")["text"].as_str().expect("text").to_owned()
@@ -135,7 +135,7 @@ fn hostile_requests_are_refused_in_one_line_and_change_nothing() {
         let line = refusal(&mut page, &request);
         assert!(line.contains(says) && !line.contains('\n'), "{request}: {line}");
     }
-    // What cannot be read at all is a fault of the page, and no news for it.
+    // A request that cannot be read counts as a fault of the page, which is not told.
     for text in [
         r#"{"do":"select","steps":[{"shape":"sphere","center":[0,0,NaN],"radius":1}]}"#,
         r#"{"do":"select","steps":[{"shape":"sphere","center":[0,0,1e999],"radius":1}]}"#,

@@ -1,4 +1,4 @@
-//! A training with pages: controlled by them, and with the bytes of one without.
+//! A training with pages: they control it, and its bytes are those of a training without pages.
 
 use crate::client::{SHOT, Socket, address_of};
 use irradia_runs::prelude::*;
@@ -28,7 +28,7 @@ fn bytes(folder: &Path, name: &str) -> Vec<u8> {
     std::fs::read(folder.join(name).join("scene.ply")).expect("a scene")
 }
 
-/// Messages until one of a training for which `enough` holds; each is answered by a new picture.
+/// Reads messages until one about the training for which `enough` holds; each picture is answered by a new request.
 fn follow(page: &mut Socket, enough: impl Fn(&str) -> bool) {
     for _ in 0..100_000 {
         match page.receive().expect("the server stays") {
@@ -47,7 +47,7 @@ fn follow(page: &mut Socket, enough: impl Fn(&str) -> bool) {
     panic!("it never came");
 }
 
-/// Pauses, steps once, saves, resumes, and looks on until the end.
+/// Pauses, steps once, saves, resumes, and watches until the end.
 fn page(address: SocketAddr) {
     let mut page = Socket::open(address);
     page.send(1, SHOT.as_bytes());

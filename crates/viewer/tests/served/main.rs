@@ -1,4 +1,4 @@
-//! The server as its clients see it, good and bad ones.
+//! The server as seen by well-behaved and hostile clients.
 
 mod client;
 mod editing;

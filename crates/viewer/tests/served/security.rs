@@ -1,4 +1,4 @@
-//! Hostile clients: refused, told once, and without effect on others.
+//! Hostile clients: refused, reported once, and without effect on others.
 
 use crate::client::{SHOT, Socket, address_of, connect};
 use irradia_runs::formats::write_splats;
@@ -11,7 +11,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 use tempfile::TempDir;
 
-/// A viewer, and the lines that it told.
+/// A viewer, and the lines that it reported.
 pub struct Served {
     viewer: Viewer,
     told: Arc<Mutex<Vec<String>>>,
@@ -62,7 +62,7 @@ impl Served {
         }
     }
 
-    /// Its file.
+    /// The file of the scene.
     pub fn scene(&self) -> &Path {
         &self.scene
     }
@@ -75,7 +75,7 @@ impl Served {
         connect(self.address())
     }
 
-    /// The head of the answer to a request with these lines after the first.
+    /// The response to a request with these lines after the first.
     fn ask(&self, target: &str, headers: &[&str]) -> String {
         let mut stream = self.connect();
         let lines: String = headers.iter().map(|line| format!("{line}\r\n")).collect();
@@ -90,7 +90,7 @@ impl Served {
         format!("Host: {}", self.address())
     }
 
-    /// The answer to a scene that is sent.
+    /// The response to sending a scene.
     pub fn send_scene(&self, target: &str, origin: &str, scene: &[u8]) -> String {
         let mut stream = self.connect();
         let host = self.host();
@@ -115,7 +115,7 @@ impl Served {
         status.unwrap_or_else(|| panic!("no status: {answer:?}"))
     }
 
-    /// Lines told that contain `part`.
+    /// Number of reported lines that contain `part`.
     fn told(&self, part: &str) -> usize {
         self.told
             .lock()
@@ -129,7 +129,7 @@ impl Served {
         Socket::open(self.address())
     }
 
-    /// A page still gets a picture.
+    /// Asserts that a page still gets a picture.
     pub fn draws(&self) {
         let mut page = self.socket();
         page.send(1, SHOT.as_bytes());
@@ -260,7 +260,7 @@ fn garbage_and_giants_end_their_own_connection_only() {
         ended.is_ok() || ended.is_err_and(|e| e.kind() == ErrorKind::ConnectionReset),
         "no HTTP"
     );
-    assert!(served.told("sent away") <= 1 && served.told("protocol") <= 1);
+    assert!(served.told("was disconnected") <= 1 && served.told("protocol") <= 1);
     served.draws();
 }
 

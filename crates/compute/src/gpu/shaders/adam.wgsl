@@ -1,6 +1,6 @@
 // Adam (Kingma and Ba 2015). Twin: `adam::AdamRule`.
 
-// First moments below this are zero.
+// First moments below this are set to zero.
 const FAINTEST_MOMENT: f32 = 1e-30;
 
 // Parameter, first and second moment after the gradient g. The rate is divided by the bias correction of the first moment; `rule` has the

@@ -1,4 +1,4 @@
-// Sums of all words before each word, from those of the blocks.
+// The sum of all words before each word, from the sums before each block.
 struct Params { count: u32, blocks: u32 }
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<storage, read> values: array<u32>;

@@ -1,6 +1,7 @@
-// Sum of the values of a workgroup's threads up to this one. `shared_sums` and `SCANNED`, the number of threads, are the kernel's.
+// Sum of the values of a workgroup's threads up to and including this one. The kernel defines `shared_sums` and `SCANNED`, the number of
+// threads.
 fn inclusive_scan(own: u32, at: u32) -> u32 {
-    // What was read there before.
+    // Other threads may still read the previous contents.
     workgroupBarrier();
     shared_sums[at] = own;
     for (var reach = 1u; reach < SCANNED; reach *= 2u) {

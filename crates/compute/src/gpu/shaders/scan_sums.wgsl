@@ -1,4 +1,4 @@
-// The blocks' sums to the sums of all blocks before each, by one workgroup; the total behind the last.
+// Replaces the sum of each block by the sum of all blocks before it, in one workgroup; the total follows the last block.
 struct Params { count: u32, blocks: u32 }
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<storage, read_write> sums: array<u32>;

@@ -1,22 +1,22 @@
 // Moves keys and values to their places by one digit of eight bits, keeping the order of equal ones. A block of 2,048 is sorted in shared
-// memory first, by four bits at a time, so that what has the same digit is written side by side.
+// memory first, by four bits at a time, so that keys with the same digit are written side by side.
 struct Params { count: u32, blocks: u32, shift: u32 }
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<storage, read> keys: array<u32>;
 @group(0) @binding(2) var<storage, read> values: array<u32>;
-// [block, digit]: keys with this digit in the blocks before; behind the last block, in all.
+// [block, digit]: number of keys with this digit in the blocks before; in the row after the last block, in all blocks.
 @group(0) @binding(3) var<storage, read> counts: array<u32>;
 @group(0) @binding(4) var<storage, read_write> sorted_keys: array<u32>;
 @group(0) @binding(5) var<storage, read_write> sorted_values: array<u32>;
 
 const SCANNED: u32 = 128u;
-// Digit and, from bit 8 on, place in the block; a word is left out behind every 16, so that threads that visit 16 in a row each meet in
-// no bank.
+// Digit and, from bit 8 on, place in the block; a word of padding follows every 16, so that threads that visit 16 in a row each cause no
+// bank conflicts.
 var<workgroup> held: array<u32, 2176>;
 // How often each thread has each of 16 digits; digits d and d + 8 share a word.
 var<workgroup> counters: array<u32, 1024>;
 var<workgroup> shared_sums: array<u32, SCANNED>;
-// Of each digit, its first place in the sorted block, and what to add to a place.
+// For each digit, the place of its first key in the sorted block, and in the output.
 var<workgroup> firsts: array<u32, 256>;
 var<workgroup> starts: array<u32, 256>;
 
@@ -26,7 +26,7 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
     let first = block * 2048u;
     for (var i = 0u; i < 16u; i++) {
         let place = i * 128u + at;
-        // What is behind the last key stays behind it.
+        // Places after the last key stay after it.
         var digit = 255u;
         if first + place < params.count {
             digit = (keys[first + place] >> params.shift) & 255u;
@@ -67,7 +67,7 @@ fn padded(place: u32) -> u32 {
     return place + (place >> 4u);
 }
 
-// Sorts what is held by four bits from `shift` on.
+// Sorts `held` by the four bits from `shift` on.
 fn split(shift: u32, at: u32) {
     for (var row = 0u; row < 8u; row++) {
         counters[row * 128u + at] = 0u;
@@ -80,7 +80,7 @@ fn split(shift: u32, at: u32) {
         counters[(digit & 7u) * 128u + at] += 1u << (2u * (digit & 8u));
     }
     workgroupBarrier();
-    // Counters to the counts before them, row by row; both halves of the words at once.
+    // Replaces counters by the sums of those before them, row by row; both halves of the words at once.
     var counted: array<u32, 8>;
     var sum = 0u;
     for (var i = 0u; i < 8u; i++) {
@@ -88,7 +88,7 @@ fn split(shift: u32, at: u32) {
         sum += counted[i];
     }
     var total = inclusive_scan(sum, at) - sum;
-    // What has a lower digit comes before all of the upper half.
+    // All digits of the lower half come before those of the upper half.
     total += (workgroupUniformLoad(&shared_sums[SCANNED - 1u]) & 0xffffu) << 16u;
     for (var i = 0u; i < 8u; i++) {
         counters[at * 8u + i] = total;

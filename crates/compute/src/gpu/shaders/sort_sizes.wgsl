@@ -1,7 +1,7 @@
-// Parameters of the passes of a sort, where the number of keys is known on the device alone. What is dispatched suffices for the largest
-// number; workgroups beyond this one have nothing to do.
+// Parameters of the passes of a sort whose number of keys is known on the device only. The workgroups that are dispatched suffice for the
+// largest possible number; those beyond the actual number have nothing to do.
 @group(0) @binding(0) var<storage, read> count: array<u32>;
-// In parts of 64 words: count, blocks, shift of each pass.
+// One part of 64 words per pass: count, blocks, shift.
 @group(0) @binding(1) var<storage, read_write> params: array<u32>;
 
 @compute @workgroup_size(32)

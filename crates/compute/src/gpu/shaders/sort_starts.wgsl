@@ -1,5 +1,5 @@
-// Counts of a digit in blocks to its counts in all blocks before; the total in the row behind the last block. A workgroup has 8 digits,
-// and 32 threads for each with a run of blocks.
+// Replaces the count of a digit in each block by its count in all blocks before; the total goes to the row after the last block. A
+// workgroup handles 8 digits with 32 threads each; a thread handles a run of blocks.
 struct Params { count: u32, blocks: u32, shift: u32 }
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<storage, read_write> counts: array<u32>;

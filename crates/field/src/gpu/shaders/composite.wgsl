@@ -1,4 +1,5 @@
-// Colour and loss of each ray, and the gradients of the networks' outputs, a thread a ray. Twin: `Worker::backward`, up to the networks.
+// Colour and loss of each ray, and the gradients of the networks' outputs, one thread per ray.
+// Twin: `Worker::backward`, up to the networks.
 @group(0) @binding(0) var<uniform> task: Task;
 @group(0) @binding(1) var<storage, read> rays: array<Ray>;
 @group(0) @binding(2) var<storage, read> starts: array<u32>;

@@ -1,4 +1,4 @@
-// Twin: `Mlp::forward`; a thread computes eight outputs of a sample.
+// Twin: one layer of `Mlp::forward`; a thread computes eight outputs of a sample.
 @group(0) @binding(0) var<uniform> layer: Layer;
 @group(0) @binding(1) var<storage, read> parameters: array<vec4f>;
 @group(0) @binding(2) var<storage, read_write> rows: array<f32>;

@@ -1,4 +1,4 @@
-// Twin: `Mlp::pull_back`, a layer; a thread computes the gradients of eight inputs of a sample.
+// Twin: one layer of `Mlp::pull_back`; a thread computes the gradients of eight inputs of a sample.
 @group(0) @binding(0) var<uniform> layer: Layer;
 @group(0) @binding(1) var<storage, read> parameters: array<f32>;
 @group(0) @binding(2) var<storage, read> rows: array<f32>;

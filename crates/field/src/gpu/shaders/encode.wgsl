@@ -1,4 +1,4 @@
-// Features of points, a thread a sample and level. Twin: `encoding::hash_grid::encode_level`.
+// Features of points, one thread per sample and level. Twin: `encoding::hash_grid::encode_level`.
 @group(0) @binding(0) var<uniform> task: Task;
 @group(0) @binding(1) var<storage, read> points: array<f32>;
 @group(0) @binding(2) var<storage, read> table: array<f32>;

@@ -1,4 +1,4 @@
-// Puts the samples of all rays side by side: points in the unit cube, middles and encoded directions, a thread a ray.
+// Stores the samples of all rays contiguously: points in the unit cube, middles and encoded directions, one thread per ray.
 @group(0) @binding(0) var<uniform> task: Task;
 @group(0) @binding(1) var<storage, read> rays: array<Ray>;
 @group(0) @binding(2) var<storage, read> middles: array<f32>;

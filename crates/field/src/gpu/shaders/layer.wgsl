@@ -6,6 +6,6 @@ struct Layer {
     rows: vec4u,
     // Samples; stride; samples of a chunk; parameters of all layers.
     samples: vec4u,
-    // Inputs whose gradient is wanted; whether they came through a ReLU; unused.
+    // Inputs whose gradient is needed; whether they came through a ReLU; unused.
     back: vec4u,
 }

@@ -1,5 +1,5 @@
-// Marches a ray through the occupied cells until it is opaque, a thread a ray. Densities come from the first output of the network,
-// evaluated in registers. FEATURES, LEVELS, WIDTH and HIDDEN (layers) are constants of the field, put before this text.
+// Marches a ray through the occupied cells until it is opaque, one thread per ray. Densities come from the first output of the network,
+// evaluated in registers. FEATURES, LEVELS, WIDTH and HIDDEN (layers) are constants of the field, prepended to this source.
 @group(0) @binding(0) var<uniform> task: Task;
 @group(0) @binding(1) var<storage, read> rays: array<Ray>;
 // A brick of 4 x 4 x 4 cells is two words.
@@ -59,7 +59,7 @@ fn network(point: vec3f) -> f32 {
 }
 
 // Cells along a side of the empty cube around a point, 0 where its cell is occupied. Twin: `OccupancyGrid::at`,
-// which knows empty blocks of bricks as well.
+// which also knows empty blocks of bricks.
 fn empty(u: vec3f) -> f32 {
     let side = task.space.x;
     let cell = vec3u(clamp(u * f32(side), vec3f(0.0), vec3f(f32(side) - 0.5)));

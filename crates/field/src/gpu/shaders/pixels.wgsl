@@ -1,4 +1,4 @@
-// Pixels of a view: colour, alpha, depth and median depth, [6, rays], a thread a ray. Twin: `render::view::pixel`.
+// Pixels of a view: colour, alpha, depth and median depth, [6, rays], one thread per ray. Twin: `render::view::pixel`.
 @group(0) @binding(0) var<uniform> task: Task;
 @group(0) @binding(1) var<storage, read> rays: array<Ray>;
 @group(0) @binding(2) var<storage, read> starts: array<u32>;

@@ -1,4 +1,4 @@
-// Twin: `space::Ray`, with what is compared.
+// Twin: `space::Ray`, with its target.
 struct Ray {
     origin: vec3f,
     near: f32,
@@ -7,7 +7,7 @@ struct Ray {
     // Unit direction in the world; fraction of a step by which samples are shifted.
     view: vec3f,
     offset: f32,
-    // In training the colour to show and the known distance, 0 where there is none. In rendering [start, near, length, 0] of
+    // In training the target colour and the known distance, 0 if unknown. In rendering [start, near, length, 0] of
     // normalised device coordinates, or [scale, 0, 0, 1].
     goal: vec4f,
     // Background; whether a learnt one takes precedence.

@@ -4,7 +4,7 @@ struct Sample {
     // Length of its interval, field units, and its transmittance.
     length: f32,
     through: f32,
-    // Derivative of the density by the network's output.
+    // Derivative of the density with respect to the network's output.
     slope: f32,
     color: vec3f,
 }
@@ -22,14 +22,14 @@ fn sample_at(s: u32) -> Sample {
     return Sample(middle, length, exp(-density.x * length), density.y, sigmoid(output));
 }
 
-// Of -|x|, which does not overflow, mirrored.
+// exp(-|x|) does not overflow; negative values follow by symmetry.
 fn sigmoid(x: vec3f) -> vec3f {
     let e = exp(-abs(x));
     let right = 1.0 / (1.0 + e);
     return select(1.0 - right, right, x >= vec3f(0.0));
 }
 
-// What is behind a ray. Twin: `background_color`.
+// The background of a ray. Twin: `background_color`.
 fn background_of(ray: Ray) -> vec3f {
     if task.space.w == 0u || ray.behind.w == 0.0 {
         return ray.behind.xyz;

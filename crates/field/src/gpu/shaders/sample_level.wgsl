@@ -1,4 +1,4 @@
-// The sample and the level of a thread, where a thread has a sample and level.
+// The sample and level of a thread, in kernels with one thread per sample and level.
 struct Place {
     sample: u32,
     level: u32,
@@ -8,7 +8,7 @@ fn place(group: u32, at: u32) -> Place {
     return Place(group / LEVELS * 256u + at, group % LEVELS);
 }
 
-// Around the sample's point.
+// The corners around the sample's point.
 fn corners_at(place: Place) -> Corners {
     let stride = task.sizes.z;
     let s = place.sample;

@@ -1,7 +1,7 @@
-// The VJP of `encode` in the table, a thread a sample and level.
+// The VJP of `encode` in the table, one thread per sample and level.
 //
-// Sums are integers of 64 bits in units of 2^-50, two words each: the order in which threads add to them does not matter, so that the
-// result is the same from run to run. (Sorting all contributions, the other way to a fixed order, would move 4 million pairs a step.)
+// Sums are 64-bit integers in units of 2^-50, two words each: the order in which threads add to them does not matter, so that the result
+// is the same from run to run. (Sorting all contributions, the other way to a fixed order, would move 4 million pairs per step.)
 @group(0) @binding(0) var<uniform> task: Task;
 @group(0) @binding(1) var<storage, read> points: array<f32>;
 @group(0) @binding(2) var<storage, read> v_rows: array<f32>;

@@ -1,4 +1,4 @@
-// What the kernels of a field have in common.
+// Inputs and functions shared by the kernels of a field.
 struct Task {
     // Rays; samples; stride of the planes of samples; most samples of a ray.
     sizes: vec4u,
@@ -38,7 +38,7 @@ fn unit(p: vec3f) -> vec3f {
     return 0.25 * (p * ((2.0 - 1.0 / m) / m)) + 0.5;
 }
 
-// The density and its derivative by the network's output. Twin: `Net::density`.
+// The density and its derivative with respect to the network's output. Twin: `Net::density`.
 fn density_of(output: f32) -> vec2f {
     let x = output + task.march.z;
     if task.space.z == 0u {

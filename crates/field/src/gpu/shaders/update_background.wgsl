@@ -1,4 +1,4 @@
-// A step of Adam on a learnt background, a workgroup a coefficient. Twin: `background_vjp`.
+// A step of Adam on a learnt background, one workgroup per coefficient. Twin: `background_vjp`.
 @group(0) @binding(0) var<uniform> update: Update;
 @group(0) @binding(1) var<storage, read> rays: array<Ray>;
 @group(0) @binding(2) var<storage, read> losses: array<f32>;

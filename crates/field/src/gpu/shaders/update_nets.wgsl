@@ -1,4 +1,4 @@
-// Adds up the chunks' gradients in their order, and takes a step of Adam, a thread a parameter of the networks.
+// Adds up the chunks' gradients in order and takes a step of Adam, one thread per parameter of the networks.
 @group(0) @binding(0) var<uniform> update: Update;
 @group(0) @binding(1) var<storage, read> sums: array<f32>;
 @group(0) @binding(2) var<storage, read_write> parameters: array<f32>;

@@ -1,6 +1,6 @@
-// A step of Adam on the entries that a sample touched, whose sums become zero, a thread a parameter.
+// A step of Adam on the entries that a sample touched, one thread per parameter; resets their sums to zero.
 @group(0) @binding(0) var<uniform> update: Update;
-// Of `scatter`: in units of 2^-50.
+// Written by `scatter`, in units of 2^-50.
 @group(0) @binding(1) var<storage, read_write> sums: array<vec2u>;
 @group(0) @binding(2) var<storage, read_write> parameters: array<f32>;
 // Both moments, [2, parameters].

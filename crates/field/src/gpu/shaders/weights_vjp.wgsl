@@ -1,5 +1,5 @@
-// The gradients of a layer's weights and biases, summed over a chunk of samples: a workgroup has a tile of 32 x 32 weights, a thread 4 x 4
-// of them. `update_nets` adds the chunks. Twin: `mlp::outer`.
+// The gradients of a layer's weights and biases, summed over a chunk of samples: a workgroup computes a tile of 32 x 32 weights, a thread
+// 4 x 4 of them. `update_nets` adds the chunks. Twin: `mlp::outer`.
 @group(0) @binding(0) var<uniform> layer: Layer;
 @group(0) @binding(1) var<storage, read> rows: array<f32>;
 @group(0) @binding(2) var<storage, read> v_rows: array<f32>;
@@ -42,7 +42,7 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
             if sample < end && tile.y + row < layer.sizes.y {
                 v = v_rows[(layer.rows.y + tile.y + row) * stride + sample];
             }
-            // By sample, so that a thread's rows lie side by side.
+            // Sample-major, so that a thread's rows are contiguous.
             xs[k % SIDE * SIDE + row] = x;
             vs[k % SIDE * SIDE + row] = v;
         }

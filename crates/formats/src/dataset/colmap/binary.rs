@@ -10,7 +10,7 @@ pub(super) const NO_POINT: u64 = u64::MAX;
 /// Parses `cameras.bin`.
 ///
 /// # Errors
-/// When it is truncated, or a model's number is unknown, and with it its length.
+/// When it is truncated, or a model's number is unknown, and therefore the length of its row.
 pub fn parse_cameras(bytes: &[u8]) -> Result<Vec<ColmapCamera>, Malformed> {
     let mut bytes = Bytes::new(bytes);
     let count = bytes.count(24, "cameras")?;

@@ -80,7 +80,7 @@ const MODELS: [(&str, usize); 18] = [
     ("EQUIRECTANGULAR", 2),
 ];
 
-/// Models of one folder that are looked at.
+/// Maximum number of models of one folder that are considered.
 const MOST_MODELS: usize = 1000;
 
 /// The folder of a model and its format.
@@ -114,7 +114,7 @@ pub(super) fn find_model(root: &Path) -> Option<ModelFiles> {
         .find_map(|below| model_in(&root.join(below)))
 }
 
-/// The model to read, and a warning if it is one of several: that with the most photographs.
+/// The model to read, which is the one with the most photographs, and a warning if there are several.
 fn largest_model(root: &Path) -> Result<Option<(ModelFiles, Option<String>)>, FormatError> {
     let mut models = numbered_models(root);
     if models.len() < 2 {
@@ -153,7 +153,7 @@ impl ModelFiles {
     }
 }
 
-/// The folder of the model in `root`, of several the one with most images, its cameras and its images.
+/// The folder of the model in `root` (of several, the one with the most images), its cameras and its images.
 ///
 /// # Errors
 /// When there is no complete model, or its files are damaged.
@@ -193,7 +193,7 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
     for image in images {
         let camera = *cameras.get(&image.camera_id).ok_or_else(|| {
             let message = format!(
-                "{} is by camera {}, which cameras does not list",
+                "{} uses camera {}, which cameras does not list",
                 image.name, image.camera_id
             );
             FormatError::malformed(&files.path("images"), message)
@@ -269,7 +269,7 @@ fn gather(points: Vec<ColmapPoint>) -> (DeclaredPoints, HashMap<u64, u32>) {
 /// Focal lengths and principal point, px, and the lens.
 ///
 /// # Errors
-/// When the model is not supported, or has another number of parameters.
+/// When the model is not supported, or the number of parameters is wrong.
 fn intrinsics(camera: &ColmapCamera) -> Result<([f64; 2], [f64; 2], Lens), Malformed> {
     let opencv = |k: [f64; 6], p: [f64; 2]| Lens::Opencv { k, p };
     Ok(match (camera.model.as_str(), &camera.params[..]) {

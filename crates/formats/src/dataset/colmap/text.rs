@@ -89,13 +89,13 @@ fn name_of(line: &str) -> Option<&str> {
     (!rest.is_empty()).then_some(rest)
 }
 
-/// Whether a line after an image contains its observations rather than the next image: an image's tenth word is a name.
+/// Whether a line after an image contains its observations rather than the next image: these are three numbers each, and an image's tenth
+/// word is a name, which may be a number.
 fn is_observations(line: &str) -> bool {
+    let words = || line.split_ascii_whitespace();
     !line.trim_start().starts_with('#')
-        && line
-            .split_ascii_whitespace()
-            .take(10)
-            .all(|word| word.parse::<f64>().is_ok())
+        && words().take(10).all(|word| word.parse::<f64>().is_ok())
+        && words().count().is_multiple_of(3)
 }
 
 fn content_lines(text: &str) -> impl Iterator<Item = (usize, &str)> {
@@ -112,7 +112,7 @@ fn utf8(bytes: &[u8]) -> Result<std::borrow::Cow<'_, str>, Malformed> {
     Ok(String::from_utf8_lossy(bytes))
 }
 
-/// The words of one line, for errors with its number.
+/// The words of one line, with its number for errors.
 struct Words<'a> {
     line: usize,
     words: SplitAsciiWhitespace<'a>,

@@ -10,7 +10,7 @@ use std::path::Path;
 pub struct ColmapModel {
     /// Cameras, each with its id.
     pub cameras: Vec<ColmapCamera>,
-    /// Images; that at index `i` gets the id `i + 1`.
+    /// Images; the one at index `i` gets the id `i + 1`.
     pub images: Vec<PosedImage>,
     /// Points.
     pub points: Vec<TrackedPoint>,
@@ -40,7 +40,7 @@ pub struct TrackedPoint {
 /// complete.
 ///
 /// # Errors
-/// When a camera's model is unknown or has another number of parameters, or a file cannot be written.
+/// When a camera's model is unknown or its number of parameters is wrong, or a file cannot be written.
 pub fn write_colmap(folder: &Path, model: &ColmapModel) -> Result<(), FormatError> {
     let numbers: Vec<u32> = model
         .cameras
@@ -50,7 +50,7 @@ pub fn write_colmap(folder: &Path, model: &ColmapModel) -> Result<(), FormatErro
             let found = MODELS.iter().position(known);
             found.map(|number| number as u32).ok_or_else(|| {
                 FormatError::Option(format!(
-                    "camera {}: {} with {} parameters is no model of COLMAP's",
+                    "camera {}: {} with {} parameters is not a COLMAP model",
                     camera.id,
                     camera.model,
                     camera.params.len()

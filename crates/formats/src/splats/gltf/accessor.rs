@@ -7,7 +7,7 @@ use std::borrow::Cow;
 /// The buffers of a document, in order.
 pub(super) type Buffers<'a> = [Cow<'a, [u8]>];
 
-/// Rows of numbers in a buffer, all within it.
+/// Rows of numbers in a buffer, checked to lie within it.
 pub(super) struct Values<'a> {
     bytes: &'a [u8],
     stride: usize,
@@ -60,7 +60,7 @@ pub(super) fn view<'a>(document: &Document, buffers: &'a Buffers, index: usize) 
 }
 
 impl<'a> Values<'a> {
-    /// The accessor `index`, which must have `width` numbers a row.
+    /// The accessor `index`, which must have `width` numbers per row.
     pub fn find(document: &Document, buffers: &'a Buffers, index: usize, width: usize) -> Result<Self, Malformed> {
         let wrong = |what: &str| Malformed(format!("its accessor {index} {what}"));
         let accessor = document.accessors.get(index).ok_or_else(|| wrong("does not exist"))?;
@@ -96,7 +96,7 @@ impl<'a> Values<'a> {
         })
     }
 
-    /// The numbers of row `i`; integers that are normalised as fractions of their largest value.
+    /// The numbers of row `i`; normalised integers are fractions of their largest value.
     pub fn row<const N: usize>(&self, i: usize) -> [f32; N] {
         let row = &self.bytes[i * self.stride..];
         std::array::from_fn(|c| {

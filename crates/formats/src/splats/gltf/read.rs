@@ -17,7 +17,7 @@ const KNOWN: [&str; 2] = [EXTENSION, "KHR_mesh_quantization"];
 /// Parses a `.glb` file.
 ///
 /// # Errors
-/// One line when it is damaged, needs an extension that is not known, has no splats, or refers to what it does not contain.
+/// When it is damaged, requires an unknown extension, has no splats, or refers to something that it does not contain.
 pub fn parse_glb(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     let mut rest = Bytes::new(bytes);
     if rest.u32()? != GLB {
@@ -43,13 +43,13 @@ pub fn parse_glb(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     let text = text.ok_or_else(|| Malformed("the .glb file has no JSON".into()))?;
     parse(text, binary, bytes.len(), &|name| {
         Err(Malformed(format!(
-            "its buffer {} is another file; convert it to one that contains its buffers",
+            "its buffer {} is in another file; convert it to a .glb that contains its buffers",
             zip::shown(name)
         )))
     })
 }
 
-/// Parses a `.gltf` file; `read` provides the files beside it that it names.
+/// Parses a `.gltf` file; `read` provides the files beside it that it refers to.
 pub(crate) fn parse_gltf(
     text: &[u8],
     read: &dyn Fn(&str) -> Result<Vec<u8>, Malformed>,
@@ -103,7 +103,7 @@ fn parse(
             encode_srgb(&mut cloud);
         }
         transform.apply(&mut cloud).ok_or_else(|| {
-            Malformed("a node mirrors its splats or has no size, for which glTF defines no splats".into())
+            Malformed("a node mirrors its splats or scales them to zero, which splats do not support".into())
         })?;
         splats += cloud.len() as u64;
         // A mesh may be placed many times.
@@ -120,15 +120,20 @@ fn parse(
     Ok(cloud)
 }
 
-/// The primitives with splats in the document's scene, in the order of its nodes, and their places.
+/// The primitives with splats in the document's scene, in the order of its nodes, and their transforms.
 fn placed_primitives(document: &Document) -> Result<Vec<(&Primitive, Affine)>, Malformed> {
     let all: Vec<usize>;
     let roots = match document.scenes.get(document.scene.unwrap_or(0)) {
         Some(scene) => &scene.nodes,
-        // Without a scene every node that is nobody's child is a root.
+        // Without a scene, every node that has no parent is a root.
         None => {
-            let is_child = |i: &usize| document.nodes.iter().any(|node| node.children.contains(i));
-            all = (0..document.nodes.len()).filter(|i| !is_child(i)).collect();
+            let mut is_child = vec![false; document.nodes.len()];
+            for child in document.nodes.iter().flat_map(|node| &node.children) {
+                if let Some(is_child) = is_child.get_mut(*child) {
+                    *is_child = true;
+                }
+            }
+            all = (0..document.nodes.len()).filter(|i| !is_child[*i]).collect();
             &all
         }
     };
@@ -188,11 +193,11 @@ fn decode(document: &Document, buffers: &Buffers, primitive: &Primitive) -> Resu
     let others = [&rotations, &scales, &opacities];
     if others.into_iter().chain(&harmonics).any(|values| values.count != count) {
         return Err(Malformed(format!(
-            "one of its attributes has another number of rows than its {count} positions"
+            "one of its attributes does not have as many rows as its {count} positions"
         )));
     }
     plausible_count(count as u64, buffers.iter().map(|buffer| buffer.len()).sum())?;
-    // A negative scale, which the extension forbids, marks a file of a draft before it, which stored ln.
+    // A negative scale, which the extension forbids, marks a file of an earlier draft, which stored ln.
     let is_ln = (0..count)
         .into_par_iter()
         .any(|i| scales.row::<3>(i).iter().any(|scale| *scale < 0.0));
@@ -210,7 +215,7 @@ fn decode(document: &Document, buffers: &Buffers, primitive: &Primitive) -> Resu
     }))
 }
 
-/// From colours in linear light to sRGB-encoded ones: exact for the colour of degree 0, and to first order for what varies about it.
+/// From colours in linear light to sRGB-encoded ones: exact for the colour of degree 0, and to first order for variations about it.
 fn encode_srgb(cloud: &mut GaussianCloud) {
     let width = 3 * cloud.sh_coefficients();
     cloud.sh.par_chunks_mut(width).for_each(|values| {

@@ -7,14 +7,14 @@ use irradia_scene::{GaussianCloud, base64, sh};
 use serde_json::{Map, Value, json};
 use std::io::{self, Write};
 
-/// Component type and target of glTF.
+/// glTF's codes of a component type and of a buffer view's target.
 const FLOAT: u32 = 5126;
 const ARRAY_BUFFER: u32 = 34962;
 
 /// Writes the numbers of a splat.
 type Values<'a> = Box<dyn Fn(usize, &mut [f32]) + Sync + 'a>;
 
-/// An attribute: name, type, numbers a splat, and the values of one.
+/// An attribute: name, type, numbers per splat, and the function that writes those of one splat.
 struct Attribute<'a> {
     name: String,
     kind: &'static str,
@@ -166,7 +166,7 @@ fn write_glb_head(out: &mut dyn Write, document: &Value, binary: usize) -> io::R
     out.write_all(&BIN_CHUNK.to_le_bytes())
 }
 
-/// Writes `cloud` in floats.
+/// Writes `cloud` as floats.
 pub(crate) fn write_glb(out: &mut dyn Write, cloud: &GaussianCloud) -> io::Result<()> {
     let attributes = attributes(cloud);
     let document = plain_document(cloud, &attributes, json!({}));
@@ -175,7 +175,7 @@ pub(crate) fn write_glb(out: &mut dyn Write, cloud: &GaussianCloud) -> io::Resul
     write_attributes(out, cloud.len(), &attributes)
 }
 
-/// Writes `cloud` in floats, as text with its buffer in base64.
+/// Writes `cloud` as floats, in text with the buffer in base64.
 pub(crate) fn write_gltf(out: &mut dyn Write, cloud: &GaussianCloud) -> io::Result<()> {
     let attributes = attributes(cloud);
     let mut bytes = Vec::new();
@@ -185,7 +185,7 @@ pub(crate) fn write_gltf(out: &mut dyn Write, cloud: &GaussianCloud) -> io::Resu
     out.write_all(&serde_json::to_vec(&document)?)
 }
 
-/// Writes `cloud` as an SPZ file of version 2, which the extension asks for, in a `.glb`.
+/// Writes `cloud` as an SPZ file of version 2, which the extension requires, in a `.glb`.
 pub(crate) fn write_glb_spz(out: &mut dyn Write, cloud: &GaussianCloud, quality: Quality) -> io::Result<()> {
     let mut packed = spz::encode(cloud, quality, SpzVersion::V2);
     let mut extension = splatting();

@@ -1,7 +1,7 @@
-//! SOG, PlayCanvas's format of images: versions 1 and 2, as a folder with `meta.json` or as one zip archive (`.sog`).
+//! SOG, PlayCanvas's image-based format: versions 1 and 2, as a folder with `meta.json` or as one zip archive (`.sog`).
 //! <https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog/>
 //!
-//! Each attribute is an image in lossless WebP with a pixel a splat, row by row: positions in two images of low and high bytes, 16
+//! Each attribute is a lossless WebP image with a pixel per splat, row by row: positions in two images of low and high bytes, 16
 //! bits between bounds of `sign(x) ln(1 + |x|)`; rotations as three bytes and 252 plus the index of the largest component of
 //! `w, x, y, z`; ln scales and DC as indices of a codebook of 256 (version 1: bytes between bounds), and with DC the opacity (version
 //! 1: its logit between bounds). Coefficients above DC are a palette: an image of up to 65,536 entries, 64 a row, and one of labels.
@@ -19,5 +19,5 @@ pub(crate) use write::{encode, write};
 pub(crate) const META: &str = "meta.json";
 /// Palette entries in a row of the image of centroids.
 const ROW: usize = 64;
-/// Value of a quaternion's fourth byte for a largest component w; x, y and z follow.
+/// Fourth byte of a quaternion whose largest component is w; the values for x, y and z follow.
 const LARGEST_W: u8 = 252;

@@ -1,5 +1,5 @@
-//! Codebooks: 256 numbers for all numbers, and a palette of vectors for all vectors. Both minimise the squared error by Lloyd's
-//! method, start from the data's own order and sum in a fixed order, so that equal scenes give equal files.
+//! Codebooks of 256 numbers that stand for all numbers, and palettes of vectors that stand for all vectors. Both minimise the squared
+//! error by Lloyd's method, start from the data's own order and sum in a fixed order, so that equal scenes give equal files.
 
 use crate::splats::rows::CHUNK;
 use rayon::prelude::*;
@@ -8,22 +8,22 @@ use std::collections::hash_map::Entry;
 
 /// Bins of the histogram by which numbers are clustered.
 const BINS: usize = 1 << 16;
-/// Bins by which their density is estimated: few, so that each has many.
+/// Bins by which their density is estimated: few, so that each holds many numbers.
 const DENSITY_BINS: usize = 512;
 /// Rounds of Lloyd's method; later ones change little.
 const ROUNDS_OF_NUMBERS: usize = 30;
 const ROUNDS_OF_COARSE: usize = 10;
 const ROUNDS_OF_FINE: usize = 8;
-/// Vectors by which the coarse clusters are found.
+/// Maximum number of vectors from which the coarse clusters are found.
 const SAMPLE: usize = 1 << 16;
-/// Centroids compared at a time: the compiler makes vectors of them.
+/// Centroids compared at a time: the compiler vectorises over them.
 const LANES: usize = 16;
 
 /// 256 numbers in increasing order.
 pub(super) struct Codebook(pub [f32; 256]);
 
 impl Codebook {
-    /// The best `count` numbers, 2 to 256, for `values`; what is not finite is ignored.
+    /// The best `count` numbers, 2 to 256, for `values`; values that are not finite are ignored.
     pub fn of(values: &[f32], count: usize) -> Self {
         let finite = || values.iter().copied().filter(|v| v.is_finite());
         let (low, high) = finite().fold((f32::MAX, f32::MIN), |(low, high), v| (low.min(v), high.max(v)));
@@ -80,8 +80,7 @@ impl Codebook {
         Some(Self(std::array::from_fn(|i| distinct[i])))
     }
 
-    /// Numbers to begin with: where the cube root of the density has its quantiles, which is the best there is for many numbers
-    /// (Panter and Dite 1951).
+    /// Initial numbers: the quantiles of the cube root of the density, which are optimal for many numbers (Panter and Dite 1951).
     fn first(bins: &[(u64, f64)], low: f64, high: f64, count: usize) -> Vec<f64> {
         let mut density = [0u64; DENSITY_BINS];
         let width = (high - low) / DENSITY_BINS as f64;
@@ -105,7 +104,7 @@ impl Codebook {
         numbers
     }
 
-    /// The number nearest to zero replaced by zero.
+    /// Replaces the number nearest to zero by zero.
     pub fn with_zero(mut self) -> Self {
         let nearest = self.index(0.0);
         self.0[usize::from(nearest)] = 0.0;
@@ -120,7 +119,7 @@ impl Codebook {
     }
 }
 
-/// Vectors, and for each vector of the scene which of them stands for it.
+/// Vectors, and for each vector of the scene the index of the one that stands for it.
 pub(super) struct Palette {
     /// `[entries, width]`
     pub entries: Vec<f32>,
@@ -128,12 +127,12 @@ pub(super) struct Palette {
 }
 
 impl Palette {
-    /// At most `most` entries (2 to 65,536) for `vectors` of `width` numbers: all that differ if they are few enough.
+    /// At most `most` entries (2 to 65,536) for `vectors` of `width` numbers: all distinct ones if they are few enough.
     pub fn of(vectors: &[f32], width: usize, most: usize) -> Self {
         if let Some(exact) = Self::exact(vectors, width, most) {
             return exact;
         }
-        // Zeros, where harmonics do not show, have one entry; many of them would begin as centroids of their own.
+        // Vectors of zeros, of splats whose harmonics do not show, share one entry; otherwise many centroids would start there.
         let is_zero = |vector: &[f32]| vector.iter().all(|v| *v == 0.0);
         let (zero, other): (Vec<usize>, Vec<usize>) =
             (0..vectors.len() / width).partition(|i| is_zero(&vectors[i * width..(i + 1) * width]));
@@ -157,7 +156,7 @@ impl Palette {
         palette
     }
 
-    /// The vectors that differ, in the order of their first use, if there are at most `most`.
+    /// The distinct vectors, in the order of their first use, if there are at most `most`.
     fn exact(vectors: &[f32], width: usize, most: usize) -> Option<Self> {
         let mut known: HashMap<Vec<u32>, u16> = HashMap::new();
         let (mut entries, mut labels) = (Vec::new(), Vec::with_capacity(vectors.len() / width));
@@ -178,8 +177,8 @@ impl Palette {
 
     /// Entries by clustering.
     ///
-    /// In two steps: the square root of `most` coarse clusters, then each by itself, with as many entries as its share of the error
-    /// asks for. This compares a vector with hundreds of centroids where one step would with tens of thousands.
+    /// In two steps: first as many coarse clusters as the square root of `most`, then the entries within each, in a number that follows
+    /// its share of the error. This compares a vector with hundreds of centroids, where one step would compare it with tens of thousands.
     fn clustered(vectors: &[f32], width: usize, most: usize) -> Self {
         let count = vectors.len() / width;
         if count <= most {
@@ -232,7 +231,8 @@ impl Palette {
     }
 }
 
-/// Entries for each cluster, `most` in all: one, and the rest by the error and the number of its members, never more than members.
+/// Number of entries of each cluster, at most `most` in total: one each, and the rest by its error and number of members, but never more
+/// than it has members.
 fn shares(members: &[Vec<u32>], errors: &[f64], most: usize) -> Vec<usize> {
     let total: f64 = errors.iter().sum::<f64>().max(f64::MIN_POSITIVE);
     let count: usize = members.iter().map(Vec::len).sum();
@@ -244,12 +244,12 @@ fn shares(members: &[Vec<u32>], errors: &[f64], most: usize) -> Vec<usize> {
     members.iter().zip(errors).map(share).collect()
 }
 
-/// Centroids in blocks of [`LANES`]: number by number, those of a block side by side.
+/// Centroids in blocks of [`LANES`]: component by component, with a block's centroids side by side.
 struct Centroids {
     count: usize,
     width: usize,
     blocks: Vec<[f32; LANES]>,
-    /// Half the squared length of each; infinite where a block has no centroid.
+    /// Half the squared length of each; infinite in unused lanes.
     halves: Vec<[f32; LANES]>,
 }
 
@@ -297,7 +297,7 @@ impl Centroids {
     }
 }
 
-/// Lloyd's method on the vectors `members`, from every n-th of them.
+/// Lloyd's method on the vectors `members`, starting from every n-th of them.
 fn lloyd(vectors: &[f32], width: usize, members: &[u32], count: usize, rounds: usize) -> Centroids {
     let vector = |i: u32| &vectors[i as usize * width..][..width];
     let count = count.min(members.len());
@@ -380,7 +380,7 @@ mod tests {
         let zeros = |i: usize| palette.entries[i * 3..][..3].iter().all(|v| *v == 0.0);
         assert_eq!((0..palette.entries.len() / 3).filter(|i| zeros(*i)).count(), 1);
         assert!((0..5000).all(|i| zeros(palette.labels[i].into()) == (i % 2 == 0)));
-        // Numbers nearer to each other than the bins of the histogram.
+        // Numbers closer together than the bins of the histogram.
         let near: Vec<f32> = (0..200).map(|i| 1.0 + i as f32 * 1e-6).chain([1000.0]).collect();
         let codebook = Codebook::of(&near, 256);
         assert!(near.iter().all(|v| codebook.0[usize::from(codebook.index(*v))] == *v));

@@ -13,9 +13,9 @@ use std::path::Path;
 
 /// `meta.json` holds a few codebooks of 256 numbers.
 pub(crate) const MAX_META: usize = 1 << 20;
-/// Pixels that an image may have beyond one a splat: writers round its sides up.
+/// Pixels that an image may have beyond four per splat: writers round its sides up.
 const SPARE_PIXELS: usize = 65_536;
-/// Entries of a palette: labels have 16 bits.
+/// Maximum number of entries of a palette: labels have 16 bits.
 const MAX_PALETTE: usize = 65_536;
 
 #[derive(Deserialize)]
@@ -61,7 +61,7 @@ struct Harmonics {
 /// Parses a `.sog` archive.
 ///
 /// # Errors
-/// One line when it is no zip archive, an image is missing, damaged or of the wrong size, or an index is out of range.
+/// When it is not a zip archive, an image is missing, damaged or of the wrong size, or an index is out of range.
 pub fn parse_zip(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     let files = zip::files(bytes)?;
     // Some tools put a folder around the files.
@@ -70,7 +70,7 @@ pub fn parse_zip(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
             .is_some_and(|rest| rest.is_empty() || rest.ends_with('/'))
     };
     let meta = files.keys().filter(is_meta).min_by_key(|name| name.len());
-    let meta = meta.ok_or_else(|| Malformed(format!("the archive contains no {META}; it is no SOG scene")))?;
+    let meta = meta.ok_or_else(|| Malformed(format!("the archive contains no {META}; it is not a SOG scene")))?;
     let folder = &meta[..meta.len() - META.len()];
     let most = bytes.len().saturating_mul(64).max(1 << 20);
     let get = |name: &str| -> Result<Cow<[u8]>, Malformed> {
@@ -90,10 +90,10 @@ pub(crate) fn read_folder(meta: &Path) -> Result<GaussianCloud, FormatError> {
     let text = crate::error::read_file(meta)?;
     let mut read_all = || -> Result<(), Malformed> {
         for name in names(&parse_meta(&text)?) {
-            // What a file names stays in its folder.
+            // A file may only refer to files in its folder.
             if name.contains(['/', '\\', ':']) || name.starts_with("..") {
                 return Err(Malformed(format!(
-                    "names the image {}, which is not a file beside it",
+                    "refers to the image {}, which is not a file beside it",
                     zip::shown(name)
                 )));
             }
@@ -134,7 +134,7 @@ fn parse_meta(text: &[u8]) -> Result<Meta, Malformed> {
     }
 }
 
-/// Whether `text` is a `meta.json` of a scene, of whatever version.
+/// Whether `text` is the `meta.json` of a scene of any version.
 pub(crate) fn is_meta(text: &[u8]) -> bool {
     serde_json::from_slice::<Meta>(text).is_ok()
 }
@@ -182,7 +182,7 @@ fn parse(get: Get) -> Result<GaussianCloud, Malformed> {
     let declared = declared.ok_or_else(|| Malformed(format!("{META} does not say how many splats there are")))?;
     let count = plausible_count(declared, bytes)?;
 
-    // Image 5, where there is one, is the palette; all others have a pixel a splat.
+    // Image 5, if there is one, is the palette; all others have a pixel per splat.
     let images: Vec<Pixels> = files
         .par_iter()
         .enumerate()
@@ -215,7 +215,7 @@ impl Pixels {
         let count = width.saturating_mul(height);
         if !(least..=most).contains(&count) {
             return Err(Malformed(format!(
-                "has {width}x{height} pixels, which do not suit the number of splats"
+                "has {width}x{height} pixels, which does not match the number of splats"
             )));
         }
         let channels = if decoder.has_alpha() { 4 } else { 3 };
@@ -244,12 +244,12 @@ impl Pixels {
     }
 }
 
-/// What the bytes of a channel mean: a table of 256.
+/// The values that the bytes of a channel stand for: a table of 256.
 #[derive(Clone, Copy)]
 struct Table([f32; 256]);
 
 impl Table {
-    /// By codebook; indices beyond its end are not to be used.
+    /// From a codebook; indices beyond its end are invalid.
     fn codebook(codebook: &[f32], attribute: &str) -> Result<Self, Malformed> {
         if codebook.is_empty() || codebook.len() > 256 {
             return Err(Malformed(format!(
@@ -257,13 +257,13 @@ impl Table {
                 codebook.len()
             )));
         }
-        // A NaN marks what is out of range.
+        // NaN marks invalid indices.
         let mut table = [f32::NAN; 256];
         table[..codebook.len()].copy_from_slice(codebook);
         Ok(Self(table))
     }
 
-    /// Whether an index is beyond the end of the codebook.
+    /// Whether some indices are beyond the end of the codebook.
     fn has_gaps(&self) -> bool {
         self.0.iter().any(|value| value.is_nan())
     }
@@ -273,10 +273,10 @@ impl Table {
     }
 }
 
-/// The coordinates of an axis by their 16 bits.
+/// Decodes the coordinates of an axis from their 16 bits.
 struct Positions {
     bounds: (f32, f32),
-    /// All of them, where there are more splats than numbers: a table takes an eighth of the time of the exponential.
+    /// All 65,536 values if there are more splats than that, else empty: a table takes an eighth of the exponential's time.
     table: Vec<f32>,
 }
 
@@ -357,7 +357,7 @@ fn decode(meta: &Meta, count: usize, images: &[Pixels]) -> Result<GaussianCloud,
         }
     });
     cloud.antialiased = meta.antialias;
-    // Only a codebook that is shorter than the indices' range marks what is beyond it.
+    // Only a codebook of fewer than 256 values has invalid indices.
     let is_short = [&scale_tables[0], &color_tables[0]].into_iter().any(Table::has_gaps)
         || palette.as_ref().is_some_and(|palette| palette.has_gaps);
     let in_range = |value: &f32| !value.is_nan();
@@ -389,7 +389,7 @@ impl<'a> Palette<'a> {
     ) -> Result<Option<Self>, Malformed> {
         let degree = match is_second {
             true => harmonics.bands,
-            // Version 1 says it by the width.
+            // Version 1 gives it by the width of the image.
             false => (1..=3)
                 .find(|degree| ROW * (sh::coefficients(*degree) - 1) == image.width)
                 .unwrap_or(9),
@@ -400,7 +400,7 @@ impl<'a> Palette<'a> {
         let coefficients = sh::coefficients(degree.min(3)) - 1;
         if degree > 3 || image.width != ROW * coefficients {
             return Err(Malformed(format!(
-                "its palette is {} pixels wide, which is not that of harmonics of degree {degree}",
+                "its palette is {} pixels wide, which does not fit harmonics of degree {degree}",
                 image.width
             )));
         }
@@ -416,7 +416,7 @@ impl<'a> Palette<'a> {
                 "a label of its harmonics is {highest}, and the palette has {entries} entries; the file is damaged"
             )));
         }
-        // The image is the entries one after another, a pixel a coefficient.
+        // The image holds the entries one after another, a pixel per coefficient.
         let pixels = entries * coefficients;
         let values = (0..pixels)
             .flat_map(|i| image.rgb(i))

@@ -25,8 +25,8 @@ pub(crate) fn write(out: &mut dyn Write, cloud: &GaussianCloud, options: &WriteO
     archive.finish()
 }
 
-/// The files of `cloud` in version 2. What was read from such files becomes equal files, but for the order of the splats: codebooks and
-/// palettes that hold everything are kept.
+/// The files of `cloud` in version 2. A scene that was read from such files becomes equal files, except for the order of the splats:
+/// codebooks and palettes that can hold all values exactly do so.
 ///
 /// # Errors
 /// When an image cannot be encoded: more than 16,384 pixels a side.
@@ -114,7 +114,7 @@ pub(crate) fn encode(cloud: &GaussianCloud, options: &WriteOptions) -> io::Resul
             .chunks_exact(rest)
             .any(|entry| entry.iter().all(|v| *v == 0.0))
         {
-            // No harmonics stay none.
+            // Harmonics of zero stay zero.
             true => codebook.with_zero(),
             false => codebook,
         };
@@ -149,19 +149,19 @@ pub(crate) fn encode(cloud: &GaussianCloud, options: &WriteOptions) -> io::Resul
     Ok(files)
 }
 
-/// An `f64` with the digits of an `f32`: half of the text is otherwise digits beyond its precision.
+/// An `f64` with the digits of an `f32`: otherwise half of the text would be digits beyond its precision.
 fn shortest(value: f32) -> f64 {
     value.to_string().parse().unwrap_or(f64::from(value))
 }
 
-/// `value` at the nearest multiple of `2^bits` up to `most`: the lowest bits are zero, and take no bytes.
+/// `value` rounded to a multiple of `2^bits`, at most `most`: the lowest bits are zero, and take no bytes.
 fn rounded(value: f64, bits: u32, most: u32) -> u32 {
     let step = f64::from(1u32 << bits);
     let value = ((value / step).round() * step).max(0.0) as u32;
     value.min(most >> bits << bits)
 }
 
-/// An image in lossless WebP, the smaller of two encodings: differences from the neighbours suit what is smooth, plain values indices.
+/// An image in lossless WebP, the smaller of two encodings: differences from neighbours suit smooth images, plain values suit indices.
 fn webp(pixels: &[u8], width: usize, height: usize, channels: usize) -> io::Result<Vec<u8>> {
     let color = if channels == 4 {
         ColorType::Rgba8

@@ -1,8 +1,8 @@
 //! SPZ, versions 1 to 4. <https://github.com/nianticlabs/spz> (the README's file format).
 //!
-//! One array an attribute: positions (24-bit fixed point; half floats in version 1), opacities, colours, ln scales, rotations
+//! One array per attribute: positions (24-bit fixed point; half floats in version 1), opacities, colours, ln scales, rotations
 //! (three bytes x, y, z up to version 2, then the smallest three in ten bits each), coefficients above DC. Versions 1 to 3 are one
-//! gzip stream of a header of 16 bytes and the arrays; version 4 is a header of 32 bytes, a table of sizes, and one zstd frame an
+//! gzip stream of a header of 16 bytes and the arrays; version 4 is a header of 32 bytes, a table of sizes, and one zstd frame per
 //! array. The axes are right, up, back.
 
 mod read;
@@ -35,7 +35,7 @@ struct Header {
 }
 
 impl Header {
-    /// Bytes a splat of each array: positions, opacities, colours, scales, rotations, coefficients above DC.
+    /// Bytes per splat of each array: positions, opacities, colours, scales, rotations, coefficients above DC.
     fn widths(&self) -> [usize; 6] {
         let position = if self.version == 1 { 6 } else { 9 };
         let rotation = if self.version >= 3 { 4 } else { 3 };

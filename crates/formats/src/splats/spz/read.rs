@@ -9,13 +9,13 @@ use irradia_scene::GaussianCloud;
 use irradia_scene::half::from_half;
 use rayon::prelude::*;
 
-/// An extension that names the axes of the file: a number for right, up, back and their alternatives.
+/// The extension that declares the axes of the file: a number for right, up, back and their alternatives.
 const ADOBE_AXES: u32 = 0xadbe_0003;
 
 /// Parses an SPZ file of version 1 to 4, compressed or as the bare stream of the versions up to 3.
 ///
 /// # Errors
-/// One line when it is no SPZ file, is damaged or truncated, or has a version, degree or axes that are not known.
+/// When it is not an SPZ file, is damaged or truncated, or has an unknown version, degree or axes.
 pub fn parse(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     if bytes.starts_with(&[0x1f, 0x8b]) {
         let mut stream = Gunzip::new(bytes);
@@ -144,7 +144,7 @@ fn parse_streams(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     Ok(decode(&header, arrays, signs))
 }
 
-/// The axes that an extension names, if one does; other extensions change nothing of the splats.
+/// The axes that an extension declares, if one does; other extensions do not affect the splats.
 fn signs_of_extensions(records: &[u8]) -> Result<Signs, Malformed> {
     let mut rest = Bytes::new(records);
     while !rest.is_empty() {
@@ -181,7 +181,7 @@ fn split(bytes: &[u8], count: usize, widths: [usize; 6]) -> [&[u8]; 6] {
     })
 }
 
-/// The splats of arrays that have the sizes of the header, in the axes that `signs` lead to.
+/// Decodes the splats in arrays of the sizes that the header implies; `signs` converts them to our axes.
 fn decode(header: &Header, arrays: [&[u8]; 6], signs: Signs) -> GaussianCloud {
     let [positions, opacities, colors, scales, rotations, harmonics] = arrays;
     let widths = header.widths();
@@ -223,7 +223,7 @@ fn decode(header: &Header, arrays: [&[u8]; 6], signs: Signs) -> GaussianCloud {
     cloud
 }
 
-/// The rotation `w, x, y, z` of the index of the largest of `x, y, z, w` and three components of sign and nine bits.
+/// The rotation `w, x, y, z` from the index of the largest of `x, y, z, w` and three components of a sign and nine bits each.
 fn rotation(bits: u32) -> [f32; 4] {
     let component = |shift: u32| {
         let (magnitude, negative) = (bits >> shift & 511, bits >> shift & 512 != 0);

@@ -9,11 +9,11 @@ use rayon::prelude::*;
 use ruzstd::encoding::{CompressionLevel, compress_to_vec};
 use std::io::{self, Write};
 
-/// Fractional bits of positions: those that the format's own writer uses, and the most.
+/// Fractional bits of positions: those of the format's own writer, and the maximum.
 const OWN_FRACTION_BITS: i32 = 12;
 const MAX_FRACTION_BITS: i32 = 20;
 
-/// Writes `cloud`; the quality chooses the bits of the coefficients above DC.
+/// Writes `cloud`; the quality selects the bits of positions and of coefficients above DC.
 pub(crate) fn write(
     out: &mut dyn Write,
     cloud: &GaussianCloud,
@@ -32,7 +32,7 @@ pub(crate) fn encode(cloud: &GaussianCloud, quality: Quality, version: SpzVersio
             SpzVersion::V4 => 4,
         },
         count: u32::try_from(cloud.len()).expect("fewer than 2^32 splats"),
-        // Readers of version 2 know no more.
+        // Readers of version 2 support no higher degree.
         degree: cloud.sh_degree.min(if version == SpzVersion::V2 { 3 } else { 4 }) as u8,
         fraction_bits: fraction_bits(&cloud.means, quality),
         flags: if cloud.antialiased { ANTIALIASED } else { 0 },
@@ -59,13 +59,14 @@ pub(crate) fn encode(cloud: &GaussianCloud, quality: Quality, version: SpzVersio
         return bytes;
     }
     bytes.push(0);
-    // Each array is given back as soon as it is copied.
+    // Each array is freed as soon as it is copied.
     arrays.into_iter().for_each(|array| bytes.extend(array));
     gzip(&bytes)
 }
 
-/// Bits after the point: at least the format's own 12, as far as the farthest coordinate fits, and otherwise so many that it has 16 bits
-/// in all, or with the best quality 23: finer steps than that are noise, which does not compress.
+/// Fractional bits of positions: the format's own 12; more at normal quality as long as the farthest coordinate has at most 16 bits in
+/// total, and up to 20 at high quality. Finer steps are noise, which does not compress. Never more than 23 bits in total, so that the
+/// farthest coordinate fits.
 fn fraction_bits(means: &[[f32; 3]], quality: Quality) -> u8 {
     let farthest = means.as_flattened().iter().fold(0f32, |most, v| most.max(v.abs()));
     let before = farthest.max(f32::MIN_POSITIVE).log2().floor() as i32 + 1;
@@ -129,14 +130,14 @@ fn arrays(cloud: &GaussianCloud, header: &Header, quality: Quality) -> [Vec<u8>;
     ]
 }
 
-/// The nearest multiple of `2^(8 - bits)`, which compresses better the fewer bits it has.
+/// The coefficient's byte, rounded to a multiple of `2^(8 - bits)`: fewer bits compress better.
 fn harmonic_byte(value: f32, bits: u32) -> u8 {
     let bucket = 1 << (8 - bits);
     let fine = (value * 128.0).round() as i32 + 128;
     ((fine.clamp(-256, 512) + bucket / 2).div_euclid(bucket) * bucket).clamp(0, 255) as u8
 }
 
-/// The index of the largest of `x, y, z, w`, and sign and nine bits of each of the others.
+/// The index of the largest of `x, y, z, w`, and a sign and nine bits for each of the others.
 fn rotation_bits(quat: [f32; 4]) -> u32 {
     let [w, x, y, z] = normalized(quat);
     let (largest, others) = smallest_three([x, y, z, w]);

@@ -1,4 +1,5 @@
-// The gradient of the loss in a tile and a channel: `finish` in `loss/ssim.rs`. Gradients of depth begin at zero, those of alpha with that of the coverage.
+// The gradient of the loss in a tile and a channel: `finish` in `loss/ssim.rs`. Gradients of depth are initialised to zero, those of
+// alpha to the gradient of the coverage term.
 @group(0) @binding(0) var<uniform> task: Target;
 @group(0) @binding(1) var<storage, read> frame: array<f32>;
 @group(0) @binding(2) var<storage, read> photo: array<u32>;
@@ -8,7 +9,7 @@
 // Planes: red, green, blue, alpha, depth, error.
 @group(0) @binding(6) var<storage, read_write> v_frame: array<f32>;
 
-// Derivatives by mu_x and the squares, and by the products: vectors of three would take the room of four.
+// Derivatives with respect to mu_x and the squares, and with respect to the products: a vec3f would take the space of a vec4f.
 var<workgroup> derivatives: array<vec2f, 702>;
 var<workgroup> third_derivatives: array<f32, 702>;
 var<workgroup> rows: array<vec2f, 442>;
@@ -24,7 +25,7 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
     let row = 2u * (at / TILE);
     var adjoint = array<vec3f, 2>();
     if has_ssim {
-        // A known number of turns, so that the loads of several are under way at once.
+        // A constant number of iterations, so that the loads of several overlap.
         for (var turn = 0u; turn < SEEN_TURNS; turn++) {
             let i = turn * THREADS + at;
             let pixel = seen_pixel(tile, i);
@@ -101,7 +102,7 @@ fn finish(abc: vec3f, to: u32, channel: u32) -> vec2f {
         v_frame[3u * pixels + to] = -bitcast<f32>(task.flags.z) * weight_at(to);
         v_frame[4u * pixels + to] = 0.0;
         if (task.flags.x & FLAG_ERROR) != 0u {
-            // The mean absolute difference, for density control; hidden pixels have none.
+            // The mean absolute difference, for density control; 0 for masked pixels.
             var error = 0.0;
             if weight_at(to) > 0.0 {
                 for (var c = 0u; c < 3u; c++) {

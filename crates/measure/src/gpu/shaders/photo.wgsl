@@ -18,7 +18,7 @@ fn weight_at(pixel: u32) -> f32 {
 fn pair_at(pixel: u32, channel: u32) -> vec2f {
     let truth = truth_at(pixel, channel);
     let weight = weight_at(pixel);
-    // Selected, not just multiplied: a render that is not finite must not pass through a weight of 0.
+    // Selected, not just multiplied: a non-finite render must not pass through a weight of 0.
     if weight > 0.0 {
         return vec2f(truth + (frame[channel * task.size.x * task.size.y + pixel] - truth) * weight, truth);
     }

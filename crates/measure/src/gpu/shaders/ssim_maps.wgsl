@@ -1,5 +1,5 @@
-// SSIM of a tile in one channel, and its derivatives by mu_x, by the mean of squares (halved) and by that of products, as
-// `differentiate` in `loss/ssim.rs` has them.
+// SSIM of a tile in one channel, and its derivatives with respect to mu_x, the mean of squares (halved) and the mean of products, as in
+// `differentiate` of `loss/ssim.rs`.
 @group(0) @binding(0) var<uniform> task: Target;
 @group(0) @binding(1) var<storage, read> frame: array<f32>;
 @group(0) @binding(2) var<storage, read> photo: array<u32>;
@@ -20,7 +20,7 @@ var<workgroup> shared_values: array<vec3f, 128>;
 @compute @workgroup_size(128)
 fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u, @builtin(local_invocation_index) at: u32) {
     let tile = tile_of(group, groups);
-    // A known number of turns, so that the loads of several are under way at once.
+    // A constant number of iterations, so that the loads of several overlap.
     for (var turn = 0u; turn < SEEN_TURNS; turn++) {
         let i = turn * THREADS + at;
         let pixel = seen_pixel(tile, i);

@@ -1,4 +1,4 @@
-// Sum over the threads of a workgroup, in a fixed order, for the first. `shared_values` is the kernel's.
+// Sum over the threads of a workgroup, in a fixed order; valid in the first thread only. The kernel declares `shared_values`.
 fn sum_group(own: vec3f, at: u32) -> vec3f {
     workgroupBarrier();
     shared_values[at] = own;

@@ -1,13 +1,13 @@
-// A photograph against a frame; see `loss/mod.rs` for the formulas.
+// Comparison of a frame with a photograph; see `loss/mod.rs` for the formulas.
 struct Target {
-    // Width and height, pixels; columns of tiles of 16 x 16; tiles.
+    // Width and height, pixels; columns of 16 x 16 tiles; tiles.
     size: vec4u,
-    // Gains of L1, of SSIM and of squares, weight of depth.
+    // Gains of L1, SSIM and squared error; weight of depth.
     gains: vec4f,
     // Bits of FLAG_*; samples of depth; gain of coverage (bits of a float); unused.
     flags: vec4u,
-    // Weights of value k of a run of 14 in the windows of four neighbours, of 12 in those of two. Not a constant: where a compiler does not unroll the loop over
-    // k, each access would make a copy of the whole.
+    // Weights of value k of a run of 14 values in the windows of four neighbours (of a run of 12 in the windows of two). Not a constant:
+    // a compiler that does not unroll the loop over k would copy the whole array at each access.
     window: array<vec4f, 14>,
 }
 
@@ -17,8 +17,9 @@ const FLAG_ERROR: u32 = 4u;
 
 const RADIUS: u32 = 5u;
 const TILE: u32 = 16u;
-// Side of a tile with what its windows see.
+// Side of the area that the windows of a tile cover, pixels.
 const SEEN: u32 = 26u;
-// Words between rows of what windows see, and of what one pass leaves of them: odd, so that threads that take a row each meet in no bank.
+// Words from row to row, of the values that windows cover and of the result of the first pass: odd, so that threads that take a row
+// each have no bank conflicts.
 const SEEN_STRIDE: u32 = 27u;
 const ROW_STRIDE: u32 = 17u;

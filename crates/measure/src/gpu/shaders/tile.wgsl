@@ -1,14 +1,14 @@
-// A tile of 16 x 16 pixels in one channel, by a workgroup of 128 threads with two pixels in a column each.
+// A tile of 16 x 16 pixels in one channel, for a workgroup of 128 threads with two vertically adjacent pixels each.
 const THREADS: u32 = 128u;
-// Turns in which all threads visit what the windows of a tile see.
+// Iterations in which all threads together visit every pixel that the windows of a tile cover.
 const SEEN_TURNS: u32 = 6u;
 
 struct Tile {
-    // Among all tiles of all channels.
+    // Index among all tiles of all channels.
     number: u32,
-    // 3 and more for groups beyond the last tile.
+    // 3 or more for groups beyond the last tile.
     channel: u32,
-    // First pixel that the windows of the tile see; may lie outside the image.
+    // First pixel that the windows of the tile cover; may be outside the image.
     corner: vec2i,
 }
 
@@ -19,7 +19,7 @@ fn tile_of(group: vec3u, groups: vec3u) -> Tile {
     return Tile(number, number / task.size.w, corner);
 }
 
-// The index in a plane of place i of the SEEN x SEEN that a tile's windows see; -1 outside the image.
+// The index in a plane of pixel i of the SEEN x SEEN that a tile's windows cover; -1 outside the image.
 fn seen_pixel(tile: Tile, i: u32) -> i32 {
     return pixel_at(tile, tile.corner + vec2i(vec2u(i % SEEN, i / SEEN)));
 }

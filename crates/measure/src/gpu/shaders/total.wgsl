@@ -1,11 +1,11 @@
-// The sums of all groups, and the loss of depth with its gradient, by one workgroup.
+// The sums over all groups, and the depth loss with its gradient, in one workgroup.
 @group(0) @binding(0) var<uniform> task: Target;
 @group(0) @binding(1) var<storage, read> frame: array<f32>;
 @group(0) @binding(2) var<storage, read> sums: array<f32>;
-// By pixel: pixel, depth and weight (bits of floats).
+// Sorted by pixel: pixel, depth and weight (bits of floats).
 @group(0) @binding(3) var<storage, read> samples: array<u32>;
 @group(0) @binding(4) var<storage, read_write> v_frame: array<f32>;
-// Sums of absolute and squared differences and of 1 - SSIM; of weighted differences of depth, and of weighted depths.
+// Sums of absolute differences, squared differences, 1 - SSIM, weighted depth differences and weighted depths.
 @group(0) @binding(5) var<storage, read_write> totals: array<f32>;
 
 // Pixels less opaque than this do not count.
@@ -20,7 +20,7 @@ struct Sample {
     depth: f32,
     rendered: f32,
     opacity: f32,
-    // 0 where it does not count.
+    // 0 if the sample does not count.
     weight: f32,
 }
 
@@ -53,7 +53,7 @@ fn main(@builtin(local_invocation_index) at: u32) {
         }
     }
     let depth = sum_group(own, at);
-    // For every thread.
+    // Broadcast to all threads.
     workgroupBarrier();
     if at == 0u {
         totals[0] = photometric.x;
@@ -70,7 +70,7 @@ fn main(@builtin(local_invocation_index) at: u32) {
     let pixels = task.size.x * task.size.y;
     for (var i = at; i < count; i += 256u) {
         let pixel = samples[3u * i];
-        // The first sample of a pixel adds them all, in their order.
+        // The thread of a pixel's first sample adds all of that pixel's samples, in order.
         if i > 0u && samples[3u * max(i, 1u) - 3u] == pixel {
             continue;
         }

@@ -252,7 +252,7 @@ pub(super) struct Backbone<T> {
 /// The activations that the VJP needs.
 pub(super) struct Tape<T> {
     input: Map<T>,
-    /// What every step returned, tap by tap.
+    /// The output of every step, tap by tap.
     outputs: Vec<Vec<StepOutput<T>>>,
 }
 

@@ -125,8 +125,8 @@ fn row_distance<T: Real>(a: &[T], b: &[T], head: &[T], mut visit: impl FnMut(usi
     total
 }
 
-/// With e the gradient by `a / |a|`: `v = (e - (a / |a|) (e . a) / |a|) / |a|`. 0 where all features are 0: there the
-/// distance has no slope, and ReLU would block the gradient.
+/// With e the gradient with respect to `a / |a|`: `v = (e - (a / |a|) (e . a) / |a|) / |a|`. 0 where all features are 0: there
+/// the distance has no slope, and ReLU would block the gradient.
 fn pixel_vjp<T: Real>(a: &[T], b: &[T], head: &[T], [scale_a, scale_b, norm_a]: [T; 3], gain: T, v: &mut [T]) {
     if norm_a == T::zero() {
         return;

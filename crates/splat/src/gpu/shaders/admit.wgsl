@@ -1,8 +1,8 @@
-// Tells the later kernels how much was found. If there is no room for all entries of tiles, it tells them nothing: the frame is empty, no
-// splat has a gradient, no update takes place, and the host repeats the step with more room.
+// Passes the numbers of visible splats and of tile entries on to the later kernels. If there is no room for all entries, it passes zeros:
+// the frame is empty, no splat has a gradient, no update takes place, and the host repeats the step with more room.
 @group(0) @binding(0) var<storage, read> found: array<u32>;
 @group(0) @binding(1) var<storage, read_write> view: View;
-// Visible splats, and in a part of their own entries, for the sorts.
+// Number of visible splats, and in a separate part that of entries, for the sorts.
 @group(0) @binding(2) var<storage, read_write> counts: array<u32>;
 
 @compute @workgroup_size(1)

@@ -1,5 +1,5 @@
 // Blends one tile of 16 x 16 pixels front to back. A thread has four pixels in a column, so that a splat read from shared memory serves
-// four of them. Entries are fetched in segments of 256; for the backward pass, the state of the pixels before each segment but the first
+// all four. Entries are fetched in segments of 256; for the backward pass, the state of the pixels before each segment but the first
 // is kept.
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> ranges: array<vec2u>;
@@ -25,7 +25,7 @@ struct Held {
 }
 
 var<workgroup> held: array<Held, 256>;
-// Whether some pixel has not ended; all that write it write 1.
+// Whether some pixel has not terminated; every thread that writes it writes 1.
 var<workgroup> live: u32;
 
 @compute @workgroup_size(64)
@@ -46,7 +46,7 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
     let segments = (range.y - range.x + 255u) / 256u;
     let trains = has(view.flags.x, FLAG_TRAINS);
 
-    // A pixel that has ended holds its transmittance with the sign flipped.
+    // A pixel that has terminated holds its transmittance with the sign flipped.
     var t = vec4f(1.0);
     var red = vec4f(0.0);
     var green = vec4f(0.0);
@@ -116,7 +116,7 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
         if at == 0u {
             reached[tile] = segment;
         }
-        // What no pixel needed has a tile as well: its gradients are zeros.
+        // Segments that no pixel needed also get their tile: their gradients are zeros.
         for (var s = segment + at; s < segments; s += 64u) {
             tile_of_segment[first_segment + s] = tile;
         }

@@ -1,4 +1,4 @@
-// The vector-Jacobian product of blending, a segment of a tile by each workgroup of 32 threads. A thread holds eight pixels of a column,
+// The vector-Jacobian product of blending, one segment of a tile per workgroup of 32 threads. A thread holds eight pixels of a column,
 // their transmittance and the light from behind, and visits the splats front to back; rows of pixels that a splat does not reach are
 // skipped. Its sums over a splat's pixels go to shared memory, where those of all threads are added for a batch of splats at a time: no
 // atomics, and every sum has a fixed order.
@@ -21,13 +21,14 @@ const THREADS: u32 = 32u;
 // Pixels of a thread: every other row of its column.
 const PIXELS: u32 = 8u;
 const SUMS: u32 = 12u;
-// Splats whose sums are added together. Few, and nothing else in shared memory that registers can hold: the less a workgroup takes, the
-// more of them run at once. An H100 took 3.0 ms with 8 splats and gradients of depth and errors there, 1.6 with 4, 1.2 with 2, and 0.9
-// with the latter in registers.
+// Splats whose sums are added together. Few, and shared memory holds nothing that fits in registers: the less of it a workgroup takes, the
+// more workgroups run at once. An H100 took 3.0 ms with 8 splats and with gradients of depth and errors in shared memory, 1.6 with 4, 1.2
+// with 2, and 0.9 with these gradients and errors in registers.
 const BATCH: u32 = 2u;
-// Quads of a row of sums, one of each thread; one is left out, so that threads that read a row each meet in no bank.
+// Quads in a row of sums, which holds one sum per thread; the last is padding, so that threads that read a row each cause no bank
+// conflicts.
 const QUADS: u32 = 9u;
-// Rows beyond a splat's extent that are visited all the same, pixels: its rounding.
+// Margin beyond a splat's extent within which rows are still visited, for rounding, pixels.
 const ROW_SLACK: f32 = 1e-2;
 
 struct Held {
@@ -128,7 +129,7 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
                 let dx = f32(column) - place.x;
                 let linear = place.w * dx;
                 let constant = fma(place.z * dx, dx, shape.y);
-                // Of v_p: its sum, with dy, with dy^2.
+                // Moments 1, dy, dy^2 of v_p.
                 var moments = vec3f(0.0);
                 var v_own = vec4f(0.0);
                 var gathered = vec2f(0.0);

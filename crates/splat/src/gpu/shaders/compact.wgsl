@@ -10,7 +10,7 @@
 fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u, @builtin(local_invocation_index) at: u32) {
     let i = group_index(group, groups) * 256u + at;
     if i < view.splats.x && visible[i] != 0u {
-        // Bits of positive numbers have the numbers' order.
+        // The bits of positive floats have the same order as the floats.
         depths[places[i]] = bitcast<u32>(footprints[3u * i + 2u].y);
         order[places[i]] = i;
     }

@@ -28,7 +28,7 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
             slot++;
         }
     }
-    // Compilers may round the same formula differently here and where tiles were counted: what is left belongs to no tile.
+    // Compilers may round the same formula differently here and where tiles were counted: slots that are left belong to no tile.
     for (; slot < end; slot++) {
         tiles[slot] = view.size.z * view.size.w;
         slots[slot] = slot;

@@ -41,7 +41,7 @@ struct Intermediate {
     thinning: f32,
 }
 
-// `variance` of the 3D smoothing filter; 0 for none.
+// `variance` is that of the 3D smoothing filter; 0 for none.
 fn intermediate(g: Geometry, variance: f32) -> Intermediate {
     var at: Intermediate;
     at.x = vec3f(

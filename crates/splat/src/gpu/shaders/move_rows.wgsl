@@ -1,4 +1,4 @@
-// Planes whose rows density control has moved, copied and set to zero.
+// Moves, copies and zeroes rows of planes as density control has done with the row numbers.
 struct Rows {
     // Rows, stride of their planes, stride of the planes before, planes.
     shape: vec4u,
@@ -6,9 +6,9 @@ struct Rows {
     first: vec4u,
 }
 @group(0) @binding(0) var<uniform> rows: Rows;
-// Where each row comes from: its number before plus 1, or 0 for zeros.
+// Source of each row: its previous number plus 1, or 0 for zeros.
 @group(0) @binding(1) var<storage, read> numbers: array<u32>;
-// Words rather than numbers, which a device may round.
+// Words rather than floats, which a device may round.
 @group(0) @binding(2) var<storage, read> before: array<u32>;
 @group(0) @binding(3) var<storage, read_write> after: array<u32>;
 

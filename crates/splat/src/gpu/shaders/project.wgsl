@@ -1,4 +1,4 @@
-// Projects every splat, evaluates its colour, counts the tiles that it touches.
+// Projects every splat, evaluates its colour, and counts the tiles that it touches.
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> geometry: array<f32>;
 @group(0) @binding(2) var<storage, read> harmonics: array<f32>;
@@ -6,7 +6,7 @@
 @group(0) @binding(4) var<storage, read_write> footprints: array<vec4f>;
 @group(0) @binding(5) var<storage, read_write> visible: array<u32>;
 @group(0) @binding(6) var<storage, read_write> touched: array<u32>;
-// Visible splats, entries of tiles.
+// Numbers of visible splats and of tile entries.
 @group(0) @binding(7) var<storage, read_write> found: array<atomic<u32>>;
 
 var<workgroup> found_here: array<atomic<u32>, 2>;
@@ -32,7 +32,7 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
         }
     }
     workgroupBarrier();
-    // Sums of whole numbers do not depend on their order.
+    // Sums of integers do not depend on their order.
     if at < 2u {
         atomicAdd(&found[at], atomicLoad(&found_here[at]));
     }

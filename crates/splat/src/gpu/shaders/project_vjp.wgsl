@@ -1,6 +1,6 @@
 // The vector-Jacobian product of projection, from the sums of blending: the twin of `project_vjp` in `render/project.rs`.
 @group(0) @binding(0) var<uniform> view: View;
-// Of each visible splat, its place front to back.
+// Place of each visible splat, front to back.
 @group(0) @binding(1) var<storage, read> places: array<u32>;
 @group(0) @binding(2) var<storage, read> firsts: array<u32>;
 @group(0) @binding(3) var<storage, read> touched: array<u32>;
@@ -12,20 +12,20 @@
 // Planes: geometry 0..11, colour 11..14, screen 14..16, gathered 16..18.
 @group(0) @binding(9) var<storage, read_write> v_splats: array<f32>;
 @group(0) @binding(10) var<storage, read_write> visible: array<u32>;
-// Visible splats, entries of tiles, splats whose gradient is not finite.
+// Numbers of visible splats, of tile entries, and of splats whose gradient is not finite.
 @group(0) @binding(11) var<storage, read_write> found: array<atomic<u32>>;
 // Planes, by place in `order`: the gradients of R, of t, and of the centre through viewing directions.
 @group(0) @binding(12) var<storage, read_write> v_camera: array<f32>;
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u, @builtin(local_invocation_index) thread: u32) {
-    // In the order of the splats, not front to back: their planes are read and written side by side.
+    // In the order of the splats, not front to back, so that neighbouring threads access neighbouring words of the planes.
     let i = group_index(group, groups) * 64u + thread;
     if i >= view.splats.x || visible[i] == 0u {
         return;
     }
     let j = places[i];
-    // Of a frame without room, nothing is known.
+    // In a void frame, which had no room for its entries, no splat counts as visible.
     if j >= view.found.x {
         return;
     }

@@ -1,4 +1,4 @@
-// Where each tile's entries begin and end; both are 0 before.
+// Where each tile's entries begin and end; both are 0 on entry.
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> tiles: array<u32>;
 @group(0) @binding(2) var<storage, read_write> ranges: array<vec2u>;

@@ -1,4 +1,4 @@
-// Segments of 256 entries of each tile; none of what belongs to no tile.
+// Number of segments of 256 entries in each tile; 0 for the entries that belong to no tile.
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> ranges: array<vec2u>;
 @group(0) @binding(2) var<storage, read_write> counts: array<u32>;

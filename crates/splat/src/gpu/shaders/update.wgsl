@@ -1,18 +1,18 @@
 // How an update uses the gradients.
 struct Update {
-    // Of means, quaternions, ln scales, opacity logits; divided by the first moment's bias correction.
+    // Learning rates of means, quaternions, ln scales, opacity logits; divided by the first moment's bias correction.
     rates: vec4f,
-    // Of SH DC and of the others; unused.
+    // Learning rates of SH DC and of the other coefficients; unused.
     sh_rates: vec4f,
     // Decay of the moments, epsilon, inverse root of the second moment's bias correction.
     adam: vec4f,
-    // Weights of opacity, its square, standard deviations, covariance, as the formulas apply them to all splats that count.
+    // Weights of opacity, its square, standard deviations, covariance; still to be divided by the number of splats that count.
     regularizers: vec4f,
-    // Screen pixels to normalised device coordinates; size below which position and shape rest; noise.
+    // Screen pixels to normalised device coordinates; size below which position and shape are frozen; amount of noise.
     scales: vec4f,
     // Splats, stride, SH coefficients trained, planes of SH.
     splats: vec4u,
-    // Bits of UPDATE_*, seed of the noise, half the span of ln scales by the condition cap (bits of a float), unused.
+    // Bits of UPDATE_*, seed of the noise, largest span of ln scales by the condition cap (bits of a float), unused.
     flags: vec4u,
 }
 

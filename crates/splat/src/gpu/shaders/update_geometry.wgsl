@@ -67,7 +67,7 @@ fn optimize(i: u32, stride: u32, is_active: bool, is_dense: bool, shapes_all: bo
         let s = exp(log_scale);
         let squares = s * s;
         let o = 1.0 / (1.0 + exp(-geometry[10u * stride + i]));
-        // The mean of all splats, or of the visible ones.
+        // Averages are over all splats, or over the visible ones.
         let count = select(view.found.x, update.splats.x, shapes_all);
         let w = update.regularizers / f32(max(count, 1u));
         let v_scale = w.z * s + 4.0 * w.w * squares * squares;
@@ -86,9 +86,9 @@ fn optimize(i: u32, stride: u32, is_active: bool, is_dense: bool, shapes_all: bo
         let mean = vec3f(geometry[i], geometry[stride + i], geometry[2u * stride + i]);
         rate_of_means *= distance(mean, view.center.xyz);
     }
-    // Position and rotation move only where they have a gradient, or with all.
+    // Position and rotation move only if they have a gradient, or in dense steps.
     let first = select(7u, 0u, is_active || is_dense);
-    // Shapes rest in dense steps like the others, unless they have gradients everywhere.
+    // In dense steps, splats without a gradient step with a gradient of zero.
     for (var p = first; p < GEOMETRY; p++) {
         var rate = rate_of_means;
         if p >= 3u {
@@ -111,7 +111,7 @@ fn optimize(i: u32, stride: u32, is_active: bool, is_dense: bool, shapes_all: bo
     }
 }
 
-// Noise of 3DGS-MCMC (Kheradmand et al. 2024, eq. 9): Gaussian, shaped by the covariance, on faint splats.
+// Noise of 3DGS-MCMC (Kheradmand et al. 2024, eq. 8): Gaussian, shaped by the covariance, on faint splats.
 fn add_noise(i: u32, stride: u32) {
     let opacity = 1.0 / (1.0 + exp(-geometry[10u * stride + i]));
     let strength = 1.0 / (1.0 + exp(NOISE_STEEPNESS * (opacity - NOISE_OPACITY)));
@@ -149,7 +149,7 @@ fn hash(v: u32) -> u32 {
     return (word >> 22u) ^ word;
 }
 
-// Standard normal, by the seed of this step, the splat and the axis (Box and Muller 1958).
+// A standard normal number, determined by the seed of this step, the splat and the axis (Box and Muller 1958).
 fn normal_number(i: u32, axis: u32) -> f32 {
     let a = hash(update.flags.y ^ hash(3u * i + axis));
     let b = hash(a);

@@ -1,4 +1,4 @@
-// Adam on spherical harmonics, whose gradients, basis times colour, are never stored. Runs before the means move.
+// Adam on spherical harmonics, whose gradients, the basis times that of the colour, are never stored. Runs before the means move.
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> update: Update;
 @group(0) @binding(2) var<storage, read> visible: array<u32>;

@@ -1,4 +1,4 @@
-// The camera and the options of a frame. Matrices are row by row; x_cam = R x + t.
+// The camera and the options of a frame. Matrices are row-major; x_cam = R x + t.
 struct View {
     // Rows of R, with t in their last components.
     rows: array<vec4f, 3>,
@@ -13,7 +13,7 @@ struct View {
     size: vec4u,
     // Splats, stride of a plane, SH degree in use, splats drawn.
     splats: vec4u,
-    // Visible splats and entries of tiles, known after projection; entries for which there is room, and whether there are more.
+    // Numbers of visible splats and of tile entries, known after projection; entries for which there is room, and whether there are more.
     found: vec4u,
     // Bits of FLAG_*.
     flags: vec4u,

@@ -1,5 +1,5 @@
-// Handles to move, turn and scale with: three axes, three planes and the centre. Where they are, which one is under the pointer,
-// and what a drag of it means; drawing is in `overlay.js`.
+// Handles for moving, turning and scaling: three axes, three planes and the centre. Computes where they are, which one is under the
+// pointer, and the motion of a drag; `overlay.js` draws them.
 
 import { project } from "../camera.js";
 import { across, add, axes, cross, dot, length, normalize, rotate, scale, subtract, turn } from "../math.js";
@@ -11,17 +11,17 @@ import { across, add, axes, cross, dot, length, normalize, rotate, scale, subtra
 /** @typedef {"move" | "rotate" | "scale"} Way */
 /** Which handle: along or about an axis, in the plane across it, or free. @typedef {{ kind: "axis" | "plane" | "free", axis: number }} Handle */
 /** Where the handles are: centre, and the directions of the axes. @typedef {{ center: Vec3, frame: Quat }} Place */
-/** First about `pivot`, then along: `x -> pivot + factor rotation (x - pivot) + shift`.
+/** A turn and a scaling about `pivot`, then a shift: `x -> pivot + factor rotation (x - pivot) + shift`.
  * @typedef {{ pivot: Vec3, rotation: Quat, factor: number, shift: Vec3 }} Motion */
-/** A camera with its picture. @typedef {{ camera: Camera, k: Intrinsics }} Shown */
+/** A camera with the intrinsics of its picture. @typedef {{ camera: Camera, k: Intrinsics }} Shown */
 
 /** Length of an axis, CSS pixels. */
 const REACH = 78;
-/** From the centre to the near and the far corner of a plane's handle, as a share of the reach. */
+/** Distance of the near and the far corner of a plane's handle from the centre along each axis, as a share of the reach. */
 export const PLANE = [0.24, 0.46];
 /** Distance at which a handle is grabbed, CSS pixels. */
 const GRAB = 9;
-/** A plane seen at a smaller sine than this cannot be dragged in. */
+/** Least sine of the angle between the view and a plane at which one can drag in the plane. */
 const FLAT = 0.12;
 
 /** @type {Quat} */
@@ -34,13 +34,14 @@ export const rest = (pivot) => ({ pivot, rotation: LEVEL, factor: 1, shift: [0, 
 export const moved = ({ pivot, rotation, factor, shift }, point) =>
   add(add(pivot, scale(rotate(rotation, subtract(point, pivot)), factor)), shift);
 
-/** World units of `pixels` at a point. @param {Shown} shown @param {Vec3} point @param {number} pixels of the picture */
+/** Length of `pixels` at a point, world units. @param {Shown} shown @param {Vec3} point @param {number} pixels of the picture */
 export function unitsAt({ camera, k }, point, pixels) {
   const depth = dot(axes(camera.rotation)[2], subtract(point, camera.position));
   return (Math.max(depth, 1e-6) * pixels) / k.fx;
 }
 
-/** The handle lines in the world. @param {Shown} shown @param {Place} place @param {number} pixel the picture's per CSS pixel */
+/** The length and the directions of the handles, world.
+ * @param {Shown} shown @param {Place} place @param {number} pixel the picture's per CSS pixel */
 export function handles(shown, { center, frame }, pixel) {
   const reach = unitsAt(shown, center, REACH * pixel);
   return { reach, directions: axes(frame) };
@@ -117,7 +118,8 @@ function ray({ camera, k }, x, y) {
   return rotate(camera.rotation, [(x - k.cx) / k.fx, (y - k.cy) / k.fy, 1]);
 }
 
-/** Where a ray meets a plane; null where it runs along it. @param {Vec3} origin @param {Vec3} direction @param {Vec3} point @param {Vec3} normal */
+/** Where a ray meets a plane; null if it is nearly parallel to it.
+ * @param {Vec3} origin @param {Vec3} direction @param {Vec3} point @param {Vec3} normal */
 function meet(origin, direction, point, normal) {
   const slope = dot(direction, normal);
   if (Math.abs(slope) < FLAT * length(direction)) return null;
@@ -140,7 +142,7 @@ export class Drag {
     this.last = this.turnedAt(x, y);
   }
 
-  /** What the drag means with the pointer at a point of the picture. @param {number} x @param {number} y @returns {Motion} */
+  /** The motion of the drag with the pointer at a point of the picture. @param {number} x @param {number} y @returns {Motion} */
   to(x, y) {
     const motion = rest(this.place.center);
     if (this.way === "move") motion.shift = this.shift(x, y);
@@ -155,7 +157,7 @@ export class Drag {
     const { center } = this.place;
     const [from, to] = [ray(this.shown, this.x, this.y), ray(this.shown, x, y)];
     if (this.handle.kind === "axis") {
-      // The plane through the axis that faces the camera most.
+      // The plane through the axis that faces the camera best.
       const normal = normalize(cross(this.axis, cross(subtract(center, position), this.axis)));
       const [a, b] = [meet(position, from, center, normal), meet(position, to, center, normal)];
       return a && b ? scale(this.axis, dot(subtract(b, a), this.axis)) : [0, 0, 0];
@@ -164,7 +166,8 @@ export class Drag {
     return a && b ? subtract(b, a) : [0, 0, 0];
   }
 
-  /** The angle about the axis at a point, radians; from the picture where the ring is seen from its side. @param {number} x @param {number} y */
+  /** The angle about the axis at a point, radians; measured in the picture if the ring is seen from its side.
+   * @param {number} x @param {number} y */
   turnedAt(x, y) {
     const { camera, k } = this.shown;
     const at = meet(camera.position, ray(this.shown, x, y), this.place.center, this.axis);

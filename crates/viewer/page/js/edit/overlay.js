@@ -11,7 +11,7 @@ import { state } from "../state.js";
 /** @typedef {import("../math.js").Vec3} Vec3 */
 /** @typedef {import("./pointer.js").Pointer} Pointer */
 
-/** Colours of lines: of a shape that adds, that subtracts, of what is selected. */
+/** Colours of lines: of shapes that add, of shapes that subtract, and of the selection. */
 const ADDS = "#6ea8fe";
 const SUBTRACTS = "#e5736f";
 const SELECTED = "#ffb800";
@@ -58,7 +58,8 @@ function drawRegion(draw, pixel, pointer) {
   draw.context.lineWidth = pixel;
 }
 
-/** A tick to the left of a line, where it selects. @param {CanvasRenderingContext2D} context @param {number[]} a @param {number[]} b @param {number} pixel */
+/** A tick on the left of a line, the side that it selects.
+ * @param {CanvasRenderingContext2D} context @param {number[]} a @param {number[]} b @param {number} pixel */
 function side(context, a, b, pixel) {
   const [x, y] = [b[0] - a[0], b[1] - a[1]];
   const reach = (14 * pixel) / Math.max(Math.hypot(x, y), 1);

@@ -1,4 +1,4 @@
-// An edit may move the whole scene, and with it what stands in it: cameras of views, and what this page looks at.
+// An edit may move the whole scene; the cameras of views and of this page then follow.
 
 import { add, length, multiply, rotate, scale, subtract, unit } from "../math.js";
 import { path } from "../path.js";
@@ -15,7 +15,7 @@ const NONE = { scale: 1, rotation: [1, 0, 0, 0], translation: [0, 0, 0] };
 /** @param {Placement} by @param {readonly number[]} point @returns {Vec3} */
 const placed = (by, point) => add(scale(rotate(by.rotation, point), by.scale), by.translation);
 
-/** First back through `from`, then through `to`. @param {Placement} from @param {Placement} to @returns {Placement} */
+/** The inverse of `from`, then `to`. @param {Placement} from @param {Placement} to @returns {Placement} */
 function between(from, to) {
   const [w, x, y, z] = from.rotation;
   const rotation = unit(multiply(to.rotation, [w, -x, -y, -z]));
@@ -28,7 +28,7 @@ const isRest = ({ scale: factor, rotation, translation }) =>
   Math.abs(factor - 1) < 1e-9 && Math.abs(Math.abs(rotation[0]) - 1) < 1e-12 && length(translation) < 1e-9;
 
 let at = NONE;
-/** Whether a scene has come. */
+/** Whether a scene has been received. */
 let seen = false;
 /** @type {import("../camera.js").View[] | null} */
 let original = null;
@@ -44,7 +44,7 @@ state.addEventListener("scene", () => {
   [at, seen] = [to, true];
   if (isRest(by)) return;
   placeViews();
-  // A page that opens on a scene that was moved has no camera to keep yet.
+  // A page opened after the scene was moved has no camera to keep yet.
   if (!isFirst) follow(by);
 });
 
@@ -53,7 +53,7 @@ function placeViews() {
   state.set({ views: original.map((view) => ({ ...view, position: placed(at, view.position), rotation: unit(multiply(at.rotation, view.rotation)) })) });
 }
 
-/** Keeps the picture: the camera moves with the scene. @param {Placement} by */
+/** Moves the camera with the scene, so that the picture stays the same. @param {Placement} by */
 function follow(by) {
   const { camera, pivot, up, measured, metres, region, view } = state.values;
   state.set({

@@ -1,4 +1,4 @@
-// Who gets the pointer on the stage: the handles of a gizmo, a selection tool, or else the camera.
+// Gives the pointer on the stage to the handles of a gizmo, to a selection tool, or else to the camera.
 
 import { Drag, LEVEL, handleAt, rest } from "./gizmo.js";
 import { add, clamp, multiply, rotate, scale } from "../math.js";
@@ -13,19 +13,19 @@ import { Tools } from "./tools.js";
 /** @typedef {import("./shapes.js").Region} Region */
 /** @typedef {import("./shapes.js").Point} Point */
 
-/** Milliseconds between two selections while a region is pulled. */
+/** Milliseconds between two selections while a region is dragged. */
 const LIVE = 150;
 
 export class Pointer extends EventTarget {
   /** @type {Drag | null} */
   drag = null;
-  /** What the drag means so far. @type {Motion | null} */
+  /** The motion of the drag so far. @type {Motion | null} */
   motion = null;
   /** The region when the drag began. @type {Region | null} */
   before = null;
   /** The handle under the pointer. @type {import("./gizmo.js").Handle | null} */
   over = null;
-  /** The pointer that is ours, and where it is. @type {{ id: number, x: number, y: number } | null} */
+  /** The pointer that is handled here, and its position. @type {{ id: number, x: number, y: number } | null} */
   held = null;
   selectedAt = 0;
 
@@ -46,7 +46,7 @@ export class Pointer extends EventTarget {
     this.dispatchEvent(new Event("change"));
   }
 
-  /** Where the handles are now, and what they do; null without any. @returns {{ place: Place, way: Way } | null} */
+  /** Where the handles are now, and what they do; null without handles. @returns {{ place: Place, way: Way } | null} */
   get gizmo() {
     if (state.get("tab") !== "edit" || !session.works || !state.get("sidebar")) return null;
     const way = state.get("transform");
@@ -66,7 +66,7 @@ export class Pointer extends EventTarget {
     return [(event.offsetX - rect.left) * this.stage.pixel, (event.offsetY - rect.top) * this.stage.pixel];
   }
 
-  /** Whether a pointer that goes down is for this. @param {PointerEvent} event */
+  /** Whether a pointer that goes down is handled here. @param {PointerEvent} event */
   claims(event) {
     if (this.held) {
       // A second finger: both move the camera.
@@ -140,7 +140,7 @@ export class Pointer extends EventTarget {
     this.changed();
   }
 
-  /** Selects what is in the region, now and then while it is pulled. @param {boolean} [now] */
+  /** Selects what is in the region; at intervals while it is dragged. @param {boolean} [now] */
   follow(now = false) {
     const chosen = state.get("region");
     const tool = this.tools.tool;
@@ -152,7 +152,7 @@ export class Pointer extends EventTarget {
   }
 }
 
-/** Makes the edit of a drag. @param {Way} way @param {Motion} motion @param {Drag} drag */
+/** Sends the edit of a drag. @param {Way} way @param {Motion} motion @param {Drag} drag */
 function apply(way, motion, drag) {
   const still = rest(motion.pivot);
   if (way === "move" && motion.shift.some((v) => v !== 0)) session.edit({ op: "move", by: motion.shift });

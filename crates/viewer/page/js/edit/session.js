@@ -1,25 +1,26 @@
-// The editing session, which all pages share: what this page asks of it. What it answers is in `state.editing`.
+// This page's requests to the editing session, which all pages share. The answers are in `state.editing`.
 
 import { connection } from "../connection.js";
 import { state } from "../state.js";
 
 /** @typedef {import("../math.js").Vec3} Vec3 */
 /** One entry of the list. @typedef {{ kind: "select" | "edit", text: string }} Entry */
-/** What the server says of the session: how many splats are selected, of how many, and the box around nearly all of them; the list, of which the
- * first `at` entries are made, from number `first` on; the gesture of the last one made.
+/** What the server tells about the session: how many splats are selected, of how many, and the box around nearly all of them; the list from
+ * entry `first` on, of which the first `at` entries are made; the gesture of the last one made.
  * @typedef {{ selected: number, of: number, hidden: number, locked: number, box: [Vec3, Vec3] | null, at: number, first: number,
  *   total: number, entries: Entry[], gesture: number, before: boolean, busy: boolean, mask: number, saved: string | null }} Editing */
 /** How a shape changes the selection. @typedef {"replace" | "add" | "subtract" | "intersect"} Mode */
 
 class Session {
-  /** Gestures of two pages differ. */
+  /** The latest gesture number; it starts at random, so that the gestures of two pages differ. */
   gestures = Math.floor(Math.random() * 2 ** 30) * 2 ** 20;
-  /** The last one that this page has sent. */
+  /** The gesture of the latest request of this page. */
   newest = 0;
   /** @type {Map<string, number>} */
   held = new Map();
 
-  /** A number for what belongs together, such as the moves of one slider: a request with the gesture of the last entry replaces it. */
+  /** A new number for requests that belong together, such as the moves of one slider: a request with the gesture of the last entry
+   * replaces it. */
   gesture() {
     return (this.gestures += 1);
   }
@@ -32,12 +33,12 @@ class Session {
     return gesture;
   }
 
-  /** The next use of a control is a new gesture. @param {string} name */
+  /** Makes the next use of a control a new gesture. @param {string} name */
   renew(name) {
     this.held.delete(name);
   }
 
-  /** Whether the last entry of the list is of a control. @param {string} name */
+  /** Whether a control made the last entry of the list. @param {string} name */
   isLive(name) {
     const known = this.held.get(name);
     return Boolean(known) && known === this.newest && (known === state.get("editing")?.gesture || this.pending);
@@ -53,8 +54,8 @@ class Session {
     connection.send(request);
   }
 
-  /** Of several shapes, all but the first change what is selected so far. @param {object[]} shapes as crate `edit` names them, in the
-   * page's coordinates @param {Mode} mode @param {number} [gesture] */
+  /** Selects by shapes; of several, all but the first change the selection so far.
+   * @param {object[]} shapes as crate `edit` names them, in the page's coordinates @param {Mode} mode @param {number} [gesture] */
   select(shapes, mode, gesture = this.gesture()) {
     const first = mode === "replace" ? "add" : mode;
     const steps = shapes.map((shape, i) => ({ mode: i ? "add" : first, ...shape }));
@@ -65,7 +66,7 @@ class Session {
     if (state.get("editing")?.selected) this.send({ do: "deselect" });
   }
 
-  /** @param {object} op as crate `edit` names it, in the page's coordinates @param {boolean} [whole] the scene, not what is selected
+  /** @param {object} op as crate `edit` names it, in the page's coordinates @param {boolean} [whole] the whole scene, not the selection
    * @param {number} [gesture] */
   edit(op, whole = false, gesture = this.gesture()) {
     this.send({ do: "edit", gesture, whole, edit: op });
@@ -96,7 +97,7 @@ class Session {
     this.send({ do: "redo" });
   }
 
-  /** To after the first `at` entries of the list. @param {number} at */
+  /** Undoes or redoes entries until the first `at` of the list are made. @param {number} at */
   go(at) {
     this.send({ do: "go", at });
   }

@@ -7,9 +7,9 @@ import { cross, normalize, rotate } from "../math.js";
 /** @typedef {import("../math.js").Vec3} Vec3 */
 /** @typedef {import("../math.js").Quat} Quat */
 /** Pixels of a picture. @typedef {[number, number]} Point */
-/** A region that stands in the scene. @typedef {{ kind: "box" | "sphere", center: Vec3, half: Vec3, rotation: Quat }} Region */
+/** A region in the scene. @typedef {{ kind: "box" | "sphere", center: Vec3, half: Vec3, rotation: Quat }} Region */
 
-/** Points of a line at most: longer lines are thinned. Each is compared with every splat. */
+/** Maximum number of points of a line: longer lines are thinned, since each point is compared with every splat. */
 const MOST_POINTS = 400;
 
 /** @param {Camera} camera @param {Intrinsics} k */
@@ -17,7 +17,7 @@ const viewpoint = (camera, k) => ({
   position: camera.position, rotation: camera.rotation, focal: [k.fx, k.fy], principal: [k.cx, k.cy], size: [k.width, k.height],
 });
 
-/** A tenth of a pixel is finer than any hand. @param {Point[]} points */
+/** Thins a line, and rounds it to tenths of a pixel, which is finer than any hand. @param {Point[]} points */
 function thinned(points) {
   const every = Math.ceil(points.length / MOST_POINTS);
   const kept = every > 1 ? points.filter((_, i) => i % every === 0 || i === points.length - 1) : points;
@@ -41,10 +41,11 @@ export function region({ kind, center, half, rotation }) {
 /** @param {Vec3} center @param {number} radius */
 export const ball = (center, radius) => ({ shape: "sphere", center, radius });
 
-/** What lies beyond a plane, on the side to which `normal` points. @param {Vec3} point @param {Vec3} normal */
+/** Everything beyond a plane, on the side to which `normal` points. @param {Vec3} point @param {Vec3} normal */
 export const halfSpace = (point, normal) => ({ shape: "half-space", point, normal });
 
-/** What is on the left of a line in the picture, drawn from `a` to `b`. @param {Camera} camera @param {Intrinsics} k @param {Point} a @param {Point} b */
+/** Everything on the left of a line in the picture, drawn from `a` to `b`.
+ * @param {Camera} camera @param {Intrinsics} k @param {Point} a @param {Point} b */
 export function beside(camera, k, a, b) {
   const [from, to] = [a, b].map(([x, y]) => /** @type {Vec3} */ ([(x - k.cx) / k.fx, (y - k.cy) / k.fy, 1]));
   return halfSpace(camera.position, normalize(rotate(camera.rotation, cross(to, from))));

@@ -1,4 +1,4 @@
-// Selection tools on the stage: what is drawn with the pointer becomes a step of the selection when it is let go.
+// Selection tools on the stage: what is drawn with the pointer becomes a step of the selection when the pointer is released.
 
 import { state } from "../state.js";
 import { ball, beside, brush, polygon } from "./shapes.js";
@@ -12,14 +12,14 @@ import { session } from "./session.js";
 /** Tools of the stage: value, name, icon, hint. */
 export const TOOLS = /** @type {const} */ ([
   ["rectangle", "Rectangle", "rectangle", "Drag a rectangle"],
-  ["lasso", "Lasso", "lasso", "Drag around what you want"],
+  ["lasso", "Lasso", "lasso", "Drag around what to select"],
   ["polygon", "Polygon", "polygon", "Click corners; Enter, a double click or the first corner closes it"],
-  ["brush", "Brush", "brush", "Paint over what you want"],
-  ["cut", "Cut", "cut", "Drag a line: all that is on its left, near and far"],
-  ["box", "Box", "box", "Click a surface to place the box, then pull its handles"],
-  ["sphere", "Sphere", "sphere", "Click a surface to place the ball, then pull its handles"],
-  ["color", "By colour", "dropper", "Click a splat of the colour"],
-  ["connected", "Connected", "connected", "Click a part: all that hangs together with it"],
+  ["brush", "Brush", "brush", "Paint over what to select"],
+  ["cut", "Cut", "cut", "Drag a line to select everything on its left, at any distance"],
+  ["box", "Box", "box", "Click a surface to place the box, then drag its handles"],
+  ["sphere", "Sphere", "sphere", "Click a surface to place the sphere, then drag its handles"],
+  ["color", "By colour", "dropper", "Click a splat with the colour to select"],
+  ["connected", "Connected", "connected", "Click a part to select everything connected with it"],
 ]);
 /** @typedef {typeof TOOLS[number][0]} Tool */
 
@@ -29,16 +29,17 @@ const NAMES = TOOLS.map(([name]) => name);
 export const isEditTool = (tool) => NAMES.includes(tool);
 /** Tools that draw a line of points. */
 const LINES = ["rectangle", "lasso", "brush", "cut"];
-/** Of these the two that are its ends or corners. */
+/** Of these, the tools with two points only: the ends of a line, or opposite corners. */
 const TWO = ["rectangle", "cut"];
 /** Distance between points of a line, CSS pixels. */
 const STEP = 2;
-/** Distance at which the first corner of a polygon is met again, CSS pixels. */
+/** Distance from the first corner at which a click closes a polygon, CSS pixels. */
 const CLOSE = 9;
 /** Milliseconds between the presses of a double click. */
 const TWICE = 400;
 
-/** How a shape changes the selection, with the keys of image editors. @param {{ shiftKey: boolean, altKey: boolean }} event @returns {Mode} */
+/** How a shape changes the selection, by the modifier keys that image editors use.
+ * @param {{ shiftKey: boolean, altKey: boolean }} event @returns {Mode} */
 export function modeOf({ shiftKey, altKey }) {
   if (shiftKey && altKey) return "intersect";
   return shiftKey ? "add" : altKey ? "subtract" : state.get("selectMode");
@@ -118,14 +119,14 @@ export class Tools extends EventTarget {
     if (drawn || this.tool === "brush") this.changed();
   }
 
-  /** The pointer is let go. @param {Point} at @param {PointerEvent} event */
+  /** The pointer is released. @param {Point} at @param {PointerEvent} event */
   up(at, event) {
     const tool = this.tool;
     if (tool && LINES.includes(tool)) this.finish();
     else if (tool && tool !== "polygon") this.touch(tool, at, modeOf(event));
   }
 
-  /** Makes a step of what has been drawn. */
+  /** Sends what has been drawn as a step of the selection. */
   finish() {
     const drawn = this.drawn;
     this.cancel();
@@ -137,11 +138,11 @@ export class Tools extends EventTarget {
     if (tool === "cut" && Math.hypot(b[0] - a[0], b[1] - a[1]) > CLOSE * this.stage.pixel) return session.select([beside(camera, k, a, b)], mode);
     const outline = /** @type {Point[]} */ (tool === "rectangle" ? [a, [b[0], a[1]], b, [a[0], b[1]]] : points);
     if (area(outline) > 9) session.select([polygon(camera, k, outline, visible)], mode);
-    // A click beside everything: nothing is selected, as in other editors.
+    // A click without a drag deselects everything, as in other editors.
     else if (mode === "replace" && tool !== "polygon") session.deselect();
   }
 
-  /** A click of a tool that asks what is there. @param {Tool} tool @param {Point} at @param {Mode} mode */
+  /** A click with a tool that needs to know what is at the point. @param {Tool} tool @param {Point} at @param {Mode} mode */
   async touch(tool, at, mode) {
     const picked = await this.stage.pickPixel(at);
     if (!picked?.point) return;
@@ -152,13 +153,13 @@ export class Tools extends EventTarget {
       state.set({ dropped: { color: picked.splat.base, mode } });
     } else if (tool === "connected" && picked.splat) {
       const reach = Math.max(picked.splat.scales[0], 0.002 * (state.get("scene")?.radius ?? 1));
-      // It grows what is selected: there is nothing that it could be taken away from.
+      // `connected` grows what is selected, so that it cannot be subtracted or intersected.
       session.select([ball(picked.splat.mean, 1.5 * reach), { shape: "connected" }], mode === "add" ? "add" : "replace");
     }
   }
 }
 
-/** Of a polygon, pixels. @param {Point[]} points */
+/** Area of a polygon, square pixels. @param {Point[]} points */
 function area(points) {
   let sum = 0;
   for (const [i, a] of points.entries()) {

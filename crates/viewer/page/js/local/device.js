@@ -4,17 +4,17 @@ import { shader } from "./assets.js";
 
 /** Threads of a workgroup. */
 export const GROUP = 256;
-/** Workgroups along one axis at most. */
+/** Maximum number of workgroups along one axis. */
 const LINE = 65535;
-/** Storage arrays that a kernel binds at most: `blend`. */
+/** Maximum number of storage arrays that a kernel binds: those of `blend`. */
 const BINDINGS = 9;
 
 /** An open device. */
 export class Gpu {
-  /** Outgrown: what is recorded may still use them. @type {GPUBuffer[]} */
+  /** Buffers that were replaced by larger ones: recorded work may still use them. @type {GPUBuffer[]} */
   outgrown = [];
 
-  /** @param {GPUDevice} device @param {(reason: string) => void} fail told once, when the device fails or is lost */
+  /** @param {GPUDevice} device @param {(reason: string) => void} fail called when the device fails or is lost */
   constructor(device, fail) {
     this.device = device;
     this.queue = device.queue;
@@ -23,15 +23,15 @@ export class Gpu {
     device.addEventListener("uncapturederror", ({ error }) => fail(error.message));
   }
 
-  /** Opens the fastest adapter; throws where there is none that can draw splats. @param {(reason: string) => void} fail */
+  /** Opens the fastest adapter; throws if there is none that can draw splats. @param {(reason: string) => void} fail */
   static async open(fail) {
-    if (!navigator.gpu) throw new Error("this browser has no WebGPU, or only for pages of this machine and of https");
+    if (!navigator.gpu) throw new Error("this browser has no WebGPU, or offers it only to pages of this machine and over https");
     const adapter = await navigator.gpu.requestAdapter({ powerPreference: "high-performance" });
     if (!adapter) throw new Error("there is no GPU for WebGPU");
     // WebGL2's rasteriser is three times faster there (SwiftShader, 4,000 splats): threads of a workgroup take turns at each barrier.
     if (isSoftware(adapter.info)) throw new Error("WebGPU runs on the CPU, where WebGL2 is faster");
     const { maxStorageBufferBindingSize, maxBufferSize, maxStorageBuffersPerShaderStage } = adapter.limits;
-    if (maxStorageBuffersPerShaderStage < BINDINGS) throw new Error(`the GPU binds ${maxStorageBuffersPerShaderStage} arrays of ${BINDINGS}`);
+    if (maxStorageBuffersPerShaderStage < BINDINGS) throw new Error(`the GPU binds only ${maxStorageBuffersPerShaderStage} of ${BINDINGS} arrays`);
     const device = await adapter.requestDevice({ requiredLimits: {
       maxStorageBuffersPerShaderStage: BINDINGS,
       maxStorageBufferBindingSize: Math.min(maxStorageBufferBindingSize, maxBufferSize),
@@ -88,7 +88,7 @@ export class Words {
     return this.gpu.device.createBuffer({ label: this.label, size, usage });
   }
 
-  /** Makes room for `words`. If there was too little, its words are zero now. @param {number} words */
+  /** Makes room for `words`. If there was too little, all words are zero afterwards. @param {number} words */
   reserve(words) {
     if (words <= this.words) return;
     this.gpu.outgrown.push(this.buffer);
@@ -96,13 +96,14 @@ export class Words {
     this.buffer = this.make(Math.max(words, Math.min(Math.ceil(1.25 * words), Math.floor(this.gpu.largest / 4))));
   }
 
-  /** Writes values from word `at` on, before whatever is submitted later. @param {number} at @param {ArrayBufferView<ArrayBuffer>} values */
+  /** Writes values from word `at` on, before any work that is submitted later.
+   * @param {number} at @param {ArrayBufferView<ArrayBuffer>} values */
   write(at, values) {
     this.gpu.queue.writeBuffer(this.buffer, 4 * at, values);
   }
 }
 
-/** Kernels that run one after another, recorded to be submitted together. */
+/** A recording of kernels that run one after another and are submitted together. */
 export class Work {
   /** @type {GPUComputePassEncoder | undefined} */
   pass;
@@ -113,7 +114,7 @@ export class Work {
     this.encoder = gpu.device.createCommandEncoder();
   }
 
-  /** Runs a kernel with so many workgroups on arrays, in the order of its bindings.
+  /** Runs a kernel with `groups` workgroups on arrays, in the order of its bindings.
    * @param {Kernel} kernel @param {Words[]} arrays @param {number} groups */
   run({ pipeline, layout }, arrays, groups) {
     if (groups === 0) return;
@@ -130,7 +131,7 @@ export class Work {
     this.end().clearBuffer(array.buffer, 0, 4 * words);
   }
 
-  /** Ends the pass of kernels; what encodes what comes between them. */
+  /** Ends the pass of kernels; returns the encoder, for commands between passes. */
   end() {
     this.pass?.end();
     this.pass = undefined;

@@ -22,7 +22,7 @@ const VIEW_WORDS = 44;
 const ANTIALIAS = 1;
 const CLAMP = 4;
 
-/** Sum of half the width or height, and the margin about the image to which means are clamped: as `ViewParams::tangent_limits`.
+/** Tangents to which means are clamped: those of the borders of the image plus a margin, as in `ViewParams::tangent_limits`.
  * @param {number} size @param {number} focal @param {number} principal pixels @returns {[number, number]} */
 const tangentLimits = (size, focal, principal) => {
   const margin = (0.15 * size) / focal;
@@ -68,7 +68,7 @@ export class Frame {
     this.mapped = gpu.device.createBuffer({ label: "found", size: 16, usage: GPUBufferUsage.MAP_READ | GPUBufferUsage.COPY_DST });
   }
 
-  /** Makes room for splats; `geometry` and `harmonics` are the caller's to fill. @param {Shape} shape */
+  /** Makes room for splats; the caller fills `geometry` and `harmonics`. @param {Shape} shape */
   reserve(shape) {
     const { stride, degree } = shape;
     this.shape = shape;
@@ -78,9 +78,9 @@ export class Frame {
     for (const array of [this.visible, this.touched, this.places, this.depths, this.order, this.counts, this.firsts]) array.reserve(stride);
   }
 
-  /** Renders the first `drawn` splats into `planes`; whether it did: not if other splats came meanwhile.
+  /** Renders the first `drawn` splats into `planes`; resolves to false if other splats were loaded meanwhile.
    *
-   * The number of entries is read back once, after projection: arrays are then as large as needed, and nothing is dropped.
+   * The number of entries is read back once, after projection, so that arrays are as large as needed and nothing is dropped.
    * @param {View} view @param {number} drawn */
   async draw(view, drawn) {
     const { gpu, kernels, shape } = this;
@@ -102,7 +102,7 @@ export class Frame {
     const tiles = Math.ceil(width / TILE) * Math.ceil(height / TILE);
     this.view.write(0, viewWords(view, shape, drawn, [visible, entries]));
     for (const array of [this.tiles, this.slots, this.splatOfSlot]) array.reserve(entries);
-    // Behind the tiles, what belongs to none.
+    // After the tiles, a range for entries that belong to none.
     this.ranges.reserve(2 * (tiles + 1));
     for (const array of [this.segmentCounts, this.firstSegments, this.reached]) array.reserve(tiles + 1);
     this.planes.reserve(FRAME_PLANES * width * height);

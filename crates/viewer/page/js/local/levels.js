@@ -1,4 +1,4 @@
-// Levels of detail behind the scene in the painters' arrays, and which of them is drawn while the camera moves: the twin of
+// Levels of detail, stored after the scene in the painters' arrays, and the choice of the one drawn while the camera moves: the twin of
 // crates/viewer/src/levels.rs.
 
 import { axes, dot, subtract } from "../math.js";
@@ -6,13 +6,13 @@ import { axes, dot, subtract } from "../math.js";
 /** @typedef {import("../camera.js").Camera} Camera */
 /** @typedef {import("../camera.js").Intrinsics} Intrinsics */
 
-/** Splats for each pixel that the scene covers which a level has at least. */
+/** Minimum number of splats of a level per covered pixel. */
 const DENSE = 2;
-/** Positions by which it is estimated what a camera sees. */
+/** Number of positions used to estimate what a camera sees. */
 const SAMPLE = 4096;
-/** Share of what a camera sees that may lie on either side of what counts as covered. */
+/** Share of the splats in view that is left out on either side when the covered area is measured. */
 const OUTSIDE = 0.05;
-/** Splats to which levels are aligned: a row of WebGL2's textures. */
+/** Alignment of levels, splats: a row of WebGL2's textures. */
 const ALIGNED = 1024;
 
 export class Levels {
@@ -27,9 +27,9 @@ export class Levels {
     this.counts = counts;
     this.loaded = counts.map(() => 0);
     this.step = Math.max(1, Math.ceil(counts[counts.length - 1] / SAMPLE));
-    /** Where each begins. @type {number[]} */
+    /** First splat of the scene and of each level. @type {number[]} */
     this.starts = [];
-    /** Room for all. */
+    /** Room for all of them, splats. */
     this.room = 0;
     for (const count of counts) {
       this.starts.push(this.room);
@@ -55,7 +55,7 @@ export class Levels {
     return level;
   }
 
-  /** Splats of the coarsest level in view for each pixel of the box that holds most of them.
+  /** Splats of the coarsest level in view per pixel of the box that contains most of them.
    * @param {Camera} camera @param {Intrinsics} k @param {number} near */
   splatsAPixel({ position, rotation }, k, near) {
     const [right, down, forward] = axes(rotation);

@@ -4,7 +4,7 @@
 // the farthest splat: evenly spaced in the logarithm, thousands of them between a depth and its double.
 
 /** @typedef {{ count: number, positions: Float32Array, radii: Float32Array, first: number }} Block */
-/** first, end: which splats; all without them.
+/** first, end: the range of splats to sort; all if absent.
  * @typedef {{ forward: number[], right: number[], down: number[], position: number[], limits: number[], near: number, first?: number, end?: number }} Look */
 
 const KEYS = 1 << 16;

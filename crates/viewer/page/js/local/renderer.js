@@ -1,4 +1,4 @@
-// Draws splats in the browser: loads them, shares out the time, and leaves painting to WebGPU or, where that is missing, to WebGL2.
+// Draws splats in the browser: loads them, keeps to the time per picture, and lets WebGPU paint or, if that is missing, WebGL2.
 
 import { openMask, openSplats } from "./assets.js";
 import { Levels } from "./levels.js";
@@ -9,35 +9,35 @@ import { WebGpu } from "./webgpu.js";
 /** @typedef {import("../camera.js").Camera} Camera */
 /** @typedef {import("../camera.js").Intrinsics} Intrinsics */
 /** @typedef {import("../math.js").Vec3} Vec3 */
-/** How to paint, beside the camera; clip: a box, world; highlight: whether selected splats are tinted; measured: whether painting
- * takes as long as the picture does.
+/** How to paint, besides the camera; clip: a box, world; highlight: whether selected splats are tinted; measured: whether painting
+ * waits for the picture, so that its time can be measured.
  * @typedef {{ near: number, background: Vec3, antialias: boolean, clip: [Vec3, Vec3] | null, highlight: boolean, mode: string, measured: boolean }} Options */
 
 const NEAR = 0.01;
-/** What both paint; other modes are WebGL2's. */
+/** The mode that both paint; only WebGL2 paints the others. */
 const PLAIN = "color";
 /** Milliseconds after which a camera is at rest. */
 const REST = 100;
-/** Milliseconds of a moving picture. */
+/** Milliseconds for a picture of a moving camera. */
 const BUDGET = 33;
-/** Milliseconds for which a newer version may be awaited whole. */
+/** Milliseconds to wait until a newer version is complete. */
 const PATIENCE = 1500;
-/** Milliseconds until a selection that came before its splats is asked for again. */
+/** Milliseconds until a selection that came before its splats is requested again. */
 const RETRY = 100;
 
 export class LocalRenderer {
-  /** What paints now; null before the beginning, and where nothing can. @type {WebGpu | WebGl | null} */
+  /** The current painter; null before the first one is open, and if there is none. @type {WebGpu | WebGl | null} */
   painter = null;
   /** @type {WebGpu | null} */
   gpu = null;
-  /** Undefined until it is needed, null if it cannot paint. @type {WebGl | null | undefined} */
+  /** Undefined until it is needed; null if it cannot paint. @type {WebGl | null | undefined} */
   webGl = undefined;
-  /** Why WebGPU does not paint; empty where it does. */
+  /** Why WebGPU does not paint; empty if it does. */
   reason = "";
   opened = false;
   /** Whether only WebGL2 may paint. */
   holds = false;
-  /** Splats of the scene, and those that have arrived. */
+  /** Number of splats of the scene, and of those that have arrived. */
   total = 0;
   loaded = 0;
   levels = new Levels([0]);
@@ -47,7 +47,7 @@ export class LocalRenderer {
   /** Whether the splats of `version` have begun to arrive, and when. */
   begun = false;
   beganAt = 0;
-  /** Whether some version has been shown whole. */
+  /** Whether some version has been shown completely. */
   complete = false;
   /** @type {Intrinsics | null} */
   k = null;
@@ -56,9 +56,9 @@ export class LocalRenderer {
   /** @type {{ camera: Camera, shot: any } | null} */
   painted = null;
   changedAt = 0;
-  /** Grows whenever a picture would be another one. */
+  /** Grows whenever a new picture would differ from the last. */
   edition = 0;
-  /** Whether what was painted last is not the newest for its camera. */
+  /** Whether there is something newer to paint for the camera that was painted last. */
   fresh = false;
   /** Whether the canvas shows the newest picture of a camera at rest, in full size. */
   sharp = false;
@@ -93,7 +93,7 @@ export class LocalRenderer {
     return this.webGl;
   }
 
-  /** Whether it can paint at all; not before the beginning. */
+  /** Whether it can paint at all; false until a painter is open. */
   get works() {
     return this.gpu !== null || Boolean(this.webGl);
   }
@@ -110,7 +110,7 @@ export class LocalRenderer {
     return this.painter?.canvas ?? null;
   }
 
-  /** Splats of the present picture. */
+  /** Number of splats in the current picture. */
   get drawn() {
     return this.painter?.drawn ?? 0;
   }
@@ -126,19 +126,19 @@ export class LocalRenderer {
 
   /** @param {string | undefined} mode */
   painterOf(mode = PLAIN) {
-    // Until it is known whether there is WebGPU, nobody paints.
+    // Nothing paints until it is known whether there is WebGPU.
     if (!this.opened) return null;
     return this.gpu && mode === PLAIN && !this.holds ? this.gpu : this.openWebGl();
   }
 
-  /** Lets WebGL2 alone paint, or no longer. @param {boolean} holds */
+  /** Lets only WebGL2 paint, or again both. @param {boolean} holds */
   holdWebGl(holds) {
     this.holds = holds;
     this.use(this.painterOf(this.wanted?.shot.mode));
     return this.webGl ?? null;
   }
 
-  /** Paints with another painter from now on, which takes the scene from its beginning; its canvas follows with its first picture.
+  /** Switches to another painter, which loads the scene from the start; its canvas is shown with its first picture.
    * @param {WebGpu | WebGl | null} painter */
   use(painter) {
     if (painter === this.painter) return;
@@ -167,7 +167,7 @@ export class LocalRenderer {
     this.report(message(error));
   }
 
-  /** A picture would be another one. */
+  /** Notes that a new picture would differ from the last. */
   change() {
     this.sharp = false;
     this.fresh = true;
@@ -181,7 +181,7 @@ export class LocalRenderer {
     this.dirty();
   }
 
-  /** Loads a version of the scene, once local drawing is wanted. @param {import("../state.js").Scene | null} scene */
+  /** Sets the version of the scene to load, once local drawing is wanted. @param {import("../state.js").Scene | null} scene */
   load(scene) {
     this.scene = scene;
   }
@@ -221,7 +221,7 @@ export class LocalRenderer {
   take(painter, block) {
     this.levels.take(block);
     painter.take(block);
-    // Levels change no picture of a camera at rest.
+    // Levels do not change the picture of a camera at rest.
     if (block.level > 0) return;
     this.loaded = block.first + block.count;
     this.changedAt = performance.now();
@@ -237,11 +237,11 @@ export class LocalRenderer {
     this.fetchMask();
   }
 
-  /** Fetches the selection once all splats are here. */
+  /** Fetches the selection once all splats have arrived. */
   async fetchMask() {
     const painter = this.painter;
     if (!painter || !this.begun || this.masked === this.mask || this.fetching || this.loaded < this.total) return;
-    // Another version comes once it is wanted.
+    // Another version is loaded once it is wanted.
     if (this.version !== this.scene?.version) return;
     this.fetching = true;
     const { mask, abort } = this;
@@ -272,7 +272,7 @@ export class LocalRenderer {
     this.aim();
   }
 
-  /** Tells the painter which camera comes. */
+  /** Tells the painter the next camera. */
   aim() {
     if (this.wanted && this.k) this.painter?.aim(this.wanted.camera, this.k, NEAR, this.level);
   }
@@ -284,14 +284,14 @@ export class LocalRenderer {
     this.aim();
   }
 
-  /** The level for a moving camera: not where splats are shown as such, or selected ones are tinted.
+  /** The level for a moving camera: 0 if individual splats are shown, or selected ones are tinted.
    * @param {{ camera: Camera, shot: any }} wanted @param {Intrinsics} k */
   levelOf({ camera, shot }, k) {
     const plain = (shot.mode ?? PLAIN) === PLAIN && !(shot.highlight && this.masked);
     return plain ? this.levels.choose(camera, scaled(k, this.share), NEAR) : 0;
   }
 
-  /** Paints if something has changed; whether there is a new picture. @param {number} now */
+  /** Paints if something has changed; returns whether there is a new picture. @param {number} now */
   draw(now) {
     const { painter, wanted, k } = this;
     if (painter && wanted && k && this.begun && !this.painting && !this.sharp) this.paint(painter, wanted, k, now);
@@ -302,7 +302,7 @@ export class LocalRenderer {
 
   /** @param {WebGpu | WebGl} painter @param {{ camera: Camera, shot: any }} wanted @param {Intrinsics} k @param {number} now */
   async paint(painter, wanted, k, now) {
-    // A newer version replaces the picture when it is whole: half of it would flicker at each edit.
+    // A newer version replaces the picture when it is complete: a part of it would flicker at each edit.
     if (this.loaded < this.total && this.complete && now < this.beganAt + PATIENCE) return;
     const rests = now - this.changedAt >= REST;
     this.useLevel(rests ? 0 : this.levelOf(wanted, k));

@@ -13,7 +13,7 @@ const SORT_BLOCK = 2048;
 /** Bits of a digit. */
 const DIGIT = 8;
 const DIGITS = 1 << DIGIT;
-/** Digits of a workgroup that sums counts up. */
+/** Number of digits per workgroup that sums counts. */
 const SUMMED = 8;
 
 /** Exclusive prefix sums of words. */
@@ -24,7 +24,7 @@ export class Scan {
     this.sums = new Words(gpu, "sums of blocks");
   }
 
-  /** `before[i]` becomes the sum of the words of `values` before `i`. Each run of a submission has its own `params`, of four words.
+  /** `before[i]` becomes the sum of the words of `values` before `i`. Each run in a submission needs its own `params`, of four words.
    * @param {Work} work @param {Words} params @param {Words} values @param {Words} before @param {number} count */
   run(work, params, values, before, count) {
     const blocks = Math.ceil(count / SCAN_BLOCK);
@@ -37,7 +37,7 @@ export class Scan {
   }
 }
 
-/** A stable sort of words with a word each. */
+/** A stable sort of words as keys, with one word each as value. */
 export class Sort {
   /** @param {Gpu} gpu @param {Record<string, Kernel>} kernels */
   constructor(gpu, kernels) {
@@ -47,14 +47,14 @@ export class Sort {
     this.other = [new Words(gpu, "sorted keys"), new Words(gpu, "sorted values")];
   }
 
-  /** Sorts the first `count` keys, and their values alike, by their lowest bits. Once per submission.
+  /** Sorts the first `count` keys by their lowest bits, and their values with them. Once per submission.
    * @param {Work} work @param {Words} keys @param {Words} values @param {number} count @param {number} bits */
   run(work, keys, values, count, bits) {
     const blocks = Math.ceil(count / SORT_BLOCK);
-    // Behind the blocks, the totals.
+    // After the blocks, the totals.
     this.counts.reserve((blocks + 1) * DIGITS);
     for (const array of this.other) array.reserve(count);
-    // An even number, so that what is sorted ends where it was.
+    // An even number, so that the result ends up in the same arrays.
     const passes = 2 * Math.ceil(bits / DIGIT / 2);
     const { sort_count, sort_starts, sort_scatter } = this.kernels;
     let [from, to] = [[keys, values], this.other];

@@ -1,4 +1,5 @@
-// Reads compact splats as they arrive: block by block, most important first, and the levels of detail after the scene. The format is that of crates/viewer/src/compact.rs.
+// Reads compact splats as they arrive: block by block, most important first, and the levels of detail after the scene. The format is
+// that of crates/viewer/src/compact.rs.
 
 const HEADER = 32;
 const CORE = 32;
@@ -37,7 +38,7 @@ export async function readSplats(response, begin, each) {
       continue;
     }
     const { done, value } = await reader.read();
-    if (done) throw new Error("the splats ended early");
+    if (done) throw new Error("the data of the splats ended early");
     if (filled + value.length > buffer.length) {
       const larger = new Uint8Array(2 * (filled + value.length));
       larger.set(buffer.subarray(0, filled));
@@ -51,7 +52,7 @@ export async function readSplats(response, begin, each) {
 /** @param {Uint8Array} bytes @returns {Header} */
 function readHeader(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset);
-  if (view.getUint32(0, true) !== 0x31535249) throw new Error("these are no splats");
+  if (view.getUint32(0, true) !== 0x31535249) throw new Error("these are not compact splats");
   const word = (/** @type {number} */ at) => view.getUint32(4 * at, true);
   const levels = [4, 5, 6].map(word).filter((count) => count > 0);
   return { counts: [word(1), ...levels], degree: word(2), block: word(3) };

@@ -8,32 +8,33 @@ import { Levels } from "./levels.js";
 /** @typedef {import("./renderer.js").Intrinsics} Intrinsics */
 /** @typedef {import("./renderer.js").Options} Options */
 
-/** Splats per row of the textures, as the shaders have it. */
+/** Splats per row of the textures, as in the shaders. */
 const ROW = 1024;
-/** Splats an instance, as the shader has it: of one splat each, instances cost a software rasteriser 4 microseconds apiece. */
+/** Splats per instance, as in the shader: with one splat each, a software rasteriser takes 4 microseconds per instance. */
 const BATCH = 128;
 const SHAPES = ["color", "ellipses", "rings", "points"];
 
 export class WebGl {
   api = "WebGL2";
-  /** Whether the worker sorts. */
+  /** Whether the worker is sorting. */
   busy = false;
-  /** Splats of the scene, those that have arrived, their degree, and those in view. */
+  /** Number of splats of the scene and of those that have arrived; then their degree, and the number in view. */
   total = 0;
   loaded = 0;
   levels = new Levels([0]);
   degree = 0;
   drawn = 0;
   generation = 0;
-  /** The splats among which the sorted ones are: the scene's, or those of a level of detail. */
+  /** The range of the splats that were sorted: the scene, or a level of detail. */
   shown = { first: 0, end: 0 };
-  /** What the splats are to be sorted for, and what they are being sorted for. @type {{ camera: Camera, k: Intrinsics, near: number, level: number } | null} */
+  /** The camera for which the splats are to be sorted, and the one for which they are being sorted.
+   * @type {{ camera: Camera, k: Intrinsics, near: number, level: number } | null} */
   wanted = null;
   /** @type {{ camera: Camera, k: Intrinsics, near: number, level: number } | null} */
   asked = null;
 
-  /** @param {WebGL2RenderingContext} gl @param {() => void} changed told when a picture would be another one
-   * @param {(reason: string) => void} fail told when the context is lost */
+  /** @param {WebGL2RenderingContext} gl @param {() => void} changed called when a new picture would differ from the last
+   * @param {(reason: string) => void} fail called when the context is lost */
   constructor(gl, changed, fail) {
     this.gl = gl;
     this.canvas = /** @type {HTMLCanvasElement} */ (gl.canvas);
@@ -47,7 +48,7 @@ export class WebGl {
     this.canvas.addEventListener("webglcontextlost", () => fail("the GPU was lost"));
   }
 
-  /** Null where the browser has no WebGL2. @param {() => void} changed @param {(reason: string) => void} fail */
+  /** Null if the browser has no WebGL2. @param {() => void} changed @param {(reason: string) => void} fail */
   static open(changed, fail) {
     const options = { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true, powerPreference: "high-performance" };
     const gl = /** @type {WebGL2RenderingContext | null} */ (document.createElement("canvas").getContext("webgl2", options));
@@ -77,7 +78,7 @@ export class WebGl {
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, bytes.length / ROW, gl.RED_INTEGER, gl.UNSIGNED_BYTE, bytes);
   }
 
-  /** Makes room; throws where there is too little. @param {Levels} levels @param {number} degree */
+  /** Makes room; throws if there is too little. @param {Levels} levels @param {number} degree */
   begin(levels, degree) {
     const gl = this.gl;
     const count = levels.counts[0];
@@ -122,7 +123,7 @@ export class WebGl {
     this.loaded = this.levels.loaded[0];
   }
 
-  /** Asks the worker for the order of a camera, one question at a time.
+  /** Asks the worker for the order of splats for a camera, one request at a time.
    * @param {Camera} camera @param {Intrinsics} k @param {number} near @param {number} level of detail */
   aim(camera, k, near, level) {
     this.wanted = { camera, k, near, level };
@@ -158,7 +159,7 @@ export class WebGl {
     if (this.asked !== this.wanted) this.sort();
   }
 
-  /** Paints at once. @param {Camera} camera @param {Intrinsics} k @param {Options} options */
+  /** Paints immediately. @param {Camera} camera @param {Intrinsics} k @param {Options} options */
   paint(camera, k, options) {
     const { gl, canvas } = this;
     const { width, height } = k;
@@ -170,12 +171,12 @@ export class WebGl {
     gl.clearColor(r, g, b, 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
     this.blend(gl, width, height, Math.max(0, SHAPES.indexOf(options.mode)));
-    // Waits for the picture, to know what it costs.
+    // Waits for the picture, to measure its cost.
     if (options.measured) gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
     return true;
   }
 
-  /** Pictures are painted on the canvas. */
+  /** Nothing to do: pictures are painted directly on the canvas. */
   present() {}
 
   /** Paints one eye of a headset. @param {WebGLFramebuffer | null} to @param {{ x: number, y: number }} port its corner, pixels

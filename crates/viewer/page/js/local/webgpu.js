@@ -1,4 +1,4 @@
-// Draws splats with WebGPU, as the program draws them.
+// Draws splats with WebGPU, in the same way as the program.
 
 import { shader } from "./assets.js";
 import { GROUP, Gpu, Words, Work } from "./device.js";
@@ -15,10 +15,10 @@ const BAND = 4;
 export class WebGpu {
   api = "WebGPU";
   accelerated = true;
-  /** Pictures are drawn whole: nothing goes on between them. */
+  /** Never busy between pictures: each is drawn as a whole. */
   busy = false;
   ready = Promise.resolve();
-  /** Splats of the scene, those to draw, and those unpacked. */
+  /** Number of splats of the scene, of those to draw, and of those unpacked. */
   total = 0;
   drawn = 0;
   unpacked = 0;
@@ -26,7 +26,7 @@ export class WebGpu {
   levels = new Levels([0]);
   /** The level of detail to draw. */
   level = 0;
-  /** By what the unpacked splats were tinted and clipped. */
+  /** The tint, clipping box and level with which the splats were unpacked. */
   dressed = "";
   /** Width and height of the last picture. */
   painted = [1, 1];
@@ -52,8 +52,9 @@ export class WebGpu {
     this.size = array("size", 2);
   }
 
-  /** Opens the device and compiles; throws where it cannot. @param {() => void} changed told when a picture would be another one
-   * @param {(reason: string) => void} fail told when the device fails later */
+  /** Opens the device and compiles the kernels; throws if that fails.
+   * @param {() => void} changed called when a new picture would differ from the last
+   * @param {(reason: string) => void} fail called when the device fails later */
   static async open(changed, fail) {
     const gpu = await Gpu.open(fail);
     const format = navigator.gpu.getPreferredCanvasFormat();
@@ -70,7 +71,7 @@ export class WebGpu {
     }
   }
 
-  /** Makes room; throws where there is too little. @param {Levels} levels @param {number} degree */
+  /** Makes room; throws if there is too little. @param {Levels} levels @param {number} degree */
   begin(levels, degree) {
     const count = levels.counts[0];
     [this.total, this.degree, this.drawn, this.unpacked, this.dressed] = [count, degree, 0, 0, ""];
@@ -97,7 +98,8 @@ export class WebGpu {
     this.selection += 1;
   }
 
-  /** Kernels sort: nothing of the camera is to be known before. @param {Camera} _camera @param {Intrinsics} _k @param {number} _near @param {number} level */
+  /** Sets the level. Kernels sort, so that the camera need not be known in advance.
+   * @param {Camera} _camera @param {Intrinsics} _k @param {number} _near @param {number} level */
   aim(_camera, _k, _near, level) {
     [this.level, this.drawn] = [level, this.levels.loaded[level]];
     this.changed();
@@ -114,7 +116,7 @@ export class WebGpu {
     return true;
   }
 
-  /** Unpacks the splats that came since, or all where tint or clipping box are others.
+  /** Unpacks the splats that have arrived since, or all of them if tint, clipping box or level have changed.
    * @param {import("./renderer.js").Options["clip"]} clip @param {boolean} highlight */
   dress(clip, highlight) {
     const { gpu, frame, drawn, level } = this;

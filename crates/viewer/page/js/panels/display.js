@@ -1,4 +1,4 @@
-// The panel of the scene: what is drawn and how, clipping, measures, the splat under the pointer.
+// The panel of the scene: what is drawn and how, clipping, measuring, the splat under the pointer.
 
 import { el, facts, row, section, segments, short } from "../dom.js";
 import { connection } from "../connection.js";
@@ -51,7 +51,7 @@ class DisplayPanel extends HTMLElement {
     });
     const light = el("select", { className: "grow", onchange: () => state.set({ light: light.value === "" ? null : Number(light.value) }) });
     const lights = row("Light", light);
-    lights.title = "As a photograph shows it, whose exposure and light the training has learned";
+    lights.title = "Shows the scene in the light of one photograph, with the exposure that the training has learned";
     state.watch(["scene", "views", "light"], () => {
       const views = state.get("views");
       lights.hidden = !state.get("scene")?.lights;
@@ -156,13 +156,13 @@ class DisplayPanel extends HTMLElement {
       const splat = picked?.splat;
       const list = (/** @type {readonly number[]} */ values) => values.map((value) => value.toPrecision(3)).join("  ");
       const unit = 1 / world().scale;
-      // In the dataset's coordinates, to a ten thousandth of the scene.
+      // In the dataset's coordinates, to one ten-thousandth of the scene.
       const digits = Math.min(9, Math.max(0, Math.ceil(4 - Math.log10(unit * (state.get("scene")?.radius || 1)))));
       const place = (/** @type {Vec3} */ point) => add(scale(point, unit), world().center).map((value) => value.toFixed(digits)).join("  ");
-      body.replaceChildren(!picked ? el("p", { className: "note", textContent: "Shows the splat under a click: size, opacity, colour, depth." }) : facts([
+      body.replaceChildren(!picked ? el("p", { className: "note", textContent: "Click a splat to see its size, opacity, colour and depth." }) : facts([
         ["Depth", short(Number((unit * picked.depth).toPrecision(6)))], ["Point", picked.point ? place(picked.point) : "–"],
         ...(splat ? /** @type {[string, string][]} */ ([
-          ["Splat", `${splat.index} of ${splat.of} here`], ["Share of the pixel", `${(100 * splat.weight).toFixed(1)} %`], ["Mean", place(splat.mean)],
+          ["Splat", `number ${splat.index}, one of ${splat.of} in this pixel`], ["Share of the pixel", `${(100 * splat.weight).toFixed(1)} %`], ["Mean", place(splat.mean)],
           ["Sizes (1 σ)", list(scale(splat.scales, unit))], ["Opacity", splat.opacity.toFixed(3)], ["Colour", list(splat.color)],
         ]) : []),
       ]));
@@ -171,14 +171,14 @@ class DisplayPanel extends HTMLElement {
   }
 }
 
-/** Who draws, and with what. */
+/** Where the picture is drawn, and with what. */
 function drawnBy() {
   const { local, drawsLocally } = stage();
   if (!local || !drawsLocally) return "on the server";
   return `here, by ${local.api}${local.api === "WebGL2" && local.reason ? ` (${local.reason})` : ""}`;
 }
 
-/** The camera with its horizon across `up`. @param {Vec3} up */
+/** The camera with its horizon perpendicular to `up`. @param {Vec3} up */
 function levelled(up) {
   const camera = state.get("camera");
   return { ...camera, rotation: lookAt(camera.position, state.get("pivot"), up) };

@@ -1,4 +1,4 @@
-// The panel of editing: tools and measures that select, what is done with the selection, the list of what was done, files.
+// The panel of editing: tools and measures that select, edits of the selection, the list of edits, files.
 
 import { choose, el, press, row, section, segments } from "../dom.js";
 import { ahead, forward } from "../camera.js";
@@ -11,7 +11,7 @@ import { session } from "../edit/session.js";
 import { state } from "../state.js";
 
 /** Names of the ways to combine. @type {[import("../edit/session.js").Mode, string, string][]} */
-const MODES = [["replace", "New", "Selects afresh"], ["add", "Add", "Adds (Shift)"], ["subtract", "Subtract", "Takes away (Alt)"], ["intersect", "Intersect", "Keeps what is in both (Shift Alt)"]];
+const MODES = [["replace", "New", "Replaces the selection"], ["add", "Add", "Adds (Shift)"], ["subtract", "Subtract", "Subtracts (Alt)"], ["intersect", "Intersect", "Keeps what is in both (Shift Alt)"]];
 /** What a slider selects: value, name, least, largest and first position, step, the shapes at a position, its text, and whether the
  * cameras must be known. @type {[string, string, number, number, number, number, (at: number) => object[], (at: number) => string, boolean?][]} */
 const MEASURES = [
@@ -32,7 +32,7 @@ const COLORS = [
 ];
 
 const radius = () => state.get("scene")?.radius ?? 1;
-/** What this view has behind a plane at a distance. @param {number} distance */
+/** Everything in this view beyond a plane at a distance. @param {number} distance */
 const beyond = (distance) => halfSpace(ahead(state.get("camera"), distance), forward(state.get("camera")));
 const count = (/** @type {number} */ value) => value.toLocaleString("en");
 
@@ -48,7 +48,7 @@ class EditPanel extends HTMLElement {
       none.hidden = all.hidden === false;
       why.textContent = editing?.why ?? "";
     });
-    // Tools of editing belong to this panel.
+    // Leaving this panel ends its tools.
     state.watch(["tab"], () => state.get("tab") !== "edit" && isEditTool(state.get("tool")) && state.set({ tool: "none" }));
   }
 
@@ -78,7 +78,7 @@ class EditPanel extends HTMLElement {
       if (chosen) session.replay(await chosen.text());
       file.value = "";
     };
-    const open = button("Open edits", "Makes the edits of an edits.toml", () => file.click());
+    const open = button("Open edits", "Applies the edits of an edits.toml file", () => file.click());
     return el("div", { className: "edit-bar" }, el("div", { className: "row" }, undo, redo, before, el("span", { className: "grow" }), save),
       el("div", { className: "row" }, format, download, el("span", { className: "grow" }), open, file));
   }
@@ -91,8 +91,8 @@ class EditPanel extends HTMLElement {
       made.dataset.tool = name;
       tools.append(made);
     }
-    const modes = segments("How the selection changes", MODES, (selectMode) => state.set({ selectMode }));
-    const visible = check("Only what the picture shows", (visibleOnly) => state.set({ visibleOnly }));
+    const modes = segments("Selection mode", MODES, (selectMode) => state.set({ selectMode }));
+    const visible = check("Only visible splats", (visibleOnly) => state.set({ visibleOnly }));
     const size = slider(4, 160, 1);
     size.input.oninput = () => state.set({ brush: Number(size.input.value) });
     const brush = row("Radius", size.input, size.value);
@@ -145,7 +145,7 @@ class EditPanel extends HTMLElement {
       if (!measure) return;
       at.value.textContent = measure[7](Number(at.input.value));
       const shapes = measure[6](Number(at.input.value));
-      // What inverts would invert what was selected before, too.
+      // A step that inverts would also invert the previous selection.
       session.select(shapes, shapes.length > 1 ? "replace" : state.get("selectMode"), session.live("measure"));
     };
     which.onchange = () => {
@@ -164,14 +164,14 @@ class EditPanel extends HTMLElement {
     return el("div", { className: "measure" }, el("div", { className: "row" }, which), body);
   }
 
-  /** What is selected, and what changes it as a whole. */
+  /** The number of selected splats, and commands that change the whole selection. */
   selection() {
     const summary = el("p", { className: "count", role: "status" });
     const highlight = check("Highlight", (highlight) => state.set({ highlight }));
     const all = button("All", "Selects everything (Ctrl A)", () => session.select([{ shape: "all" }], "replace"));
     const invert = button("Invert", "Selects what is not selected (Ctrl I)", () => session.select([{ shape: "invert" }], "add"));
     const grow = button("Grow", "Adds what is close", () => session.select([{ shape: "grow", by: 0.01 * radius() }], "add"));
-    const connected = button("Connected", "Adds what hangs together with it", () => session.select([{ shape: "connected" }], "add"));
+    const connected = button("Connected", "Adds what is connected with the selection", () => session.select([{ shape: "connected" }], "add"));
     const none = button("None", "Selects nothing (Ctrl D)", () => session.deselect());
     state.watch(["editing", "highlight"], () => {
       const editing = state.get("editing");
@@ -189,13 +189,13 @@ class EditPanel extends HTMLElement {
     const edits = [
       button("Delete", "Deletes the selection (Delete)", () => session.edit({ op: "delete" })),
       button("Keep", "Deletes everything else", () => session.edit({ op: "keep" })),
-      button("Duplicate", "Adds a copy, which is selected then", () => session.edit({ op: "duplicate", by: [0, 0, 0] })),
-      button("Hide", "Neither draws nor writes the selection", () => session.edit({ op: "hide" })),
-      button("Lock", "Keeps the selection from being selected", () => session.edit({ op: "lock" })),
-      button("Split off", "Moves the selection into a scene of its own, which Save writes", () => session.edit({ op: "split", name: "part" })),
+      button("Duplicate", "Adds a copy and selects it", () => session.edit({ op: "duplicate", by: [0, 0, 0] })),
+      button("Hide", "Leaves the selection out of pictures and files", () => session.edit({ op: "hide" })),
+      button("Lock", "Locks the selection, so that it cannot be selected", () => session.edit({ op: "lock" })),
+      button("Split off", "Moves the selection into a separate scene, which Save writes", () => session.edit({ op: "split", name: "part" })),
     ];
     const show = button("", "Shows what is hidden", () => session.edit({ op: "show" }, true));
-    const unlock = button("", "Lets what is locked be selected", () => session.edit({ op: "unlock" }, true));
+    const unlock = button("", "Makes locked splats selectable again", () => session.edit({ op: "unlock" }, true));
     const ways = segments("Handles", [["none", "Off"], ["move", "Move"], ["rotate", "Rotate"], ["scale", "Scale"]],
       (transform) => state.set({ transform: /** @type {any} */ (transform) }));
     state.watch(["editing", "transform"], () => {
@@ -219,18 +219,18 @@ class EditPanel extends HTMLElement {
     for (const { input } of sliders) input.oninput = () => session.edit({ op: "recolor", ...values() }, whole(), session.live("recolor"));
     opacity.input.oninput = () => session.edit({ op: "opacity", factor: Number(opacity.input.value) }, whole(), session.live("opacity"));
     state.watch(["editing"], () => {
-      // Sliders tell of the last edit; when something else is done, they begin anew.
+      // Sliders show the last edit; after another action they return to neutral.
       if (!session.isLive("recolor")) for (const { input, neutral } of sliders) input.value = `${neutral}`;
       if (!session.isLive("opacity")) opacity.input.value = "1";
       for (const { input, value } of sliders) value.textContent = Number(input.value).toFixed(2);
       opacity.value.textContent = `× ${Number(opacity.input.value).toFixed(2)}`;
-      of.textContent = whole() ? "Of the whole scene" : "Of the selection";
+      of.textContent = whole() ? "Applies to the whole scene" : "Applies to the selection";
     });
     return section("Colour", ...sliders.map(({ name, input, value }) => row(name, input, value)), row("Opacity", opacity.input, opacity.value), el("p", { className: "note" }, of));
   }
 
   scene() {
-    const found = button("Find", "Finds up and the ground from the cameras and the densest plane", () => session.edit({ op: "upright" }, true));
+    const found = button("Find", "Finds the up axis and the ground from the cameras and the densest plane", () => session.edit({ op: "upright" }, true));
     state.watch(["views"], () => (found.hidden = state.get("views").length === 0));
     const view = button("This view's up", "Turns the scene so that the up axis of the Scene panel points up in its file", () => session.edit({ op: "upright", up: state.get("up") }, true));
     const known = el("input", { type: "number", min: "0", step: "any", placeholder: "metres", "aria-label": "Metres between the points" });
@@ -248,9 +248,9 @@ class EditPanel extends HTMLElement {
       if (chosen) await session.merge(chosen);
       other.value = "";
     };
-    const merge = button("Merge", "Adds the splats of another scene, which are selected then", () => other.click());
+    const merge = button("Merge", "Adds the splats of another scene and selects them", () => other.click());
     const number = el("input", { type: "number", min: "1", step: "1000", "aria-label": "Number of splats to keep" });
-    const reduce = button("Reduce", "Leaves the splats that cover most", () => {
+    const reduce = button("Reduce", "Keeps the splats that cover the most", () => {
       if (Number(number.value) >= 1) session.edit({ op: "reduce", count: Math.round(Number(number.value)) }, true);
     });
     state.watch(["measured", "editing"], () => {
@@ -262,7 +262,7 @@ class EditPanel extends HTMLElement {
   }
 
   history() {
-    const list = el("ol", { className: "history", "aria-label": "What was done" });
+    const list = el("ol", { className: "history", "aria-label": "History of edits" });
     const saved = el("p", { className: "note", role: "status" });
     state.watch(["editing"], () => {
       const editing = state.get("editing");
@@ -290,7 +290,7 @@ const button = (text, title, onclick) => el("button", { type: "button", textCont
 /** @param {Parameters<typeof icon>[0]} name @param {string} label @param {() => void} onclick */
 const tool = (name, label, onclick) => el("button", { type: "button", className: "icon", title: label, "aria-label": label, onclick }, icon(name));
 
-/** A row of buttons, which have names of their own. @param {string} label @param {...Node} controls */
+/** A row of controls that have their own names. @param {string} label @param {...Node} controls */
 const line = (label, ...controls) => el("div", { className: "row" }, el("span", { className: "label", textContent: label }), ...controls);
 
 /** @param {number} min @param {number} max @param {number} step */

@@ -7,7 +7,7 @@ import { state } from "../state.js";
 class PathPanel extends HTMLElement {
   connectedCallback() {
     const add = el("button", { type: "button", className: "primary", textContent: "Add this camera", onclick: () => path.add(state.get("camera")) });
-    const views = el("button", { type: "button", textContent: "From the views", title: "Up to twelve of the views, evenly", onclick: () => this.fromViews() });
+    const views = el("button", { type: "button", textContent: "From the views", title: "Up to twelve of the views, evenly spaced", onclick: () => this.fromViews() });
     const clear = el("button", { type: "button", textContent: "Clear", onclick: () => {
       path.keys = [];
       path.changed();
@@ -36,7 +36,7 @@ class PathPanel extends HTMLElement {
       section("Timing", row("Seconds", seconds), row("Frames/s", fps),
         el("div", { className: "columns" }, el("label", { className: "check" }, loop, "Loop"), el("label", { className: "check" }, ease, "Ease in and out"))),
       section("File", el("div", { className: "row" }, save, open, file),
-        el("p", { className: "note", textContent: "Renders to frames or a film: irradia render RUN --path path.json --out film.mp4" })),
+        el("p", { className: "note", textContent: "Render it to frames or a film: irradia render RUN --path path.json --out film.mp4" })),
     );
     const show = () => {
       count.textContent = path.keys.length ? `${path.keys.length} key frames, ${path.seconds.toFixed(1)} s` : "Fly somewhere and add the camera; the timeline appears below.";
@@ -78,7 +78,7 @@ class PathPanel extends HTMLElement {
     try {
       if (file) path.read(JSON.parse(await file.text()));
     } catch (error) {
-      state.set({ problem: error instanceof SyntaxError ? "This file is no JSON" : String(/** @type {Error} */ (error).message) });
+      state.set({ problem: error instanceof SyntaxError ? "This file is not JSON" : String(/** @type {Error} */ (error).message) });
     }
   }
 }

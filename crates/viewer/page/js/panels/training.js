@@ -1,4 +1,4 @@
-// The panel of a training: where it stands, its curves, what it may be told; the recipe, to be looked up.
+// The panel of a training: its progress, curves and controls, and the recipe with a search.
 
 import "../chart.js";
 import { clock, el, facts, section, short } from "../dom.js";
@@ -7,7 +7,7 @@ import { state } from "../state.js";
 
 /** @typedef {import("../chart.js").Chart} Chart */
 
-/** Milliseconds between two pictures of the curves. */
+/** Milliseconds between two updates of the curves. */
 const BETWEEN = 1000;
 const PHASES = { preparing: "Preparing", training: "Training", paused: "Paused", finished: "Finished" };
 
@@ -24,7 +24,7 @@ class TrainingPanel extends HTMLElement {
     const button = (/** @type {string} */ text, /** @type {string} */ action, /** @type {string} */ hint) =>
       el("button", { type: "button", textContent: text, title: hint, onclick: () => train(action) });
     const pause = button("Pause", "pause", "Pause after this step (P)");
-    const resume = button("Resume", "resume", "Go on (P)");
+    const resume = button("Resume", "resume", "Resume (P)");
     const step = button("One step", "step", "One step, then pause");
     const save = button("Save now", "save", "Write a checkpoint");
     const stop = button("Stop and finish", "stop", "Stop, save, evaluate; resume later with irradia train --resume");
@@ -91,7 +91,8 @@ class TrainingPanel extends HTMLElement {
   }
 }
 
-/** The stages in proportion to their steps, with a mark for now. @param {HTMLElement} plan @param {any} outline @param {number} done
+/** Shows the stages in proportion to their steps, with a mark at the current step.
+ * @param {HTMLElement} plan @param {any} outline @param {number} done
  * @param {string} stage */
 function showPlan(plan, outline, done, stage) {
   if (!outline) return;

@@ -1,4 +1,4 @@
-// The panel of the views: thumbnails, PSNR, a jump into each.
+// The panel of the views: thumbnails, PSNR, and a jump to each view.
 
 import { choose, el, section, segments } from "../dom.js";
 import { connection, pictureOf } from "../connection.js";

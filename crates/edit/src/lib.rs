@@ -47,7 +47,7 @@ pub use ground::{Ground, ground};
 pub use history::History;
 pub use list::{Edit, EditList, Operation, UpAxis};
 pub use photographs::{Photographs, Taken};
-pub use plan::{Applied, Open, Provenance, apply, open_nothing};
+pub use plan::{Applied, Open, Provenance, apply, apply_to, open_nothing};
 pub use select::select;
 pub use selection::Selection;
 pub use shape::{Mode, SelectStep, Shape, Viewpoint};

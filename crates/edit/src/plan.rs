@@ -87,6 +87,19 @@ pub fn apply(draft: &mut Draft, edit: &Edit, open: Open) -> Result<Applied, Edit
     Ok(Plan::new(draft, edit, open)?.carry_out(draft))
 }
 
+/// Like [`apply`], for an edit whose steps are known to give `selection` on this scene: they are not evaluated again. Edits that show or
+/// unlock splats, and those of the whole scene, do not use it.
+///
+/// # Errors
+/// The same.
+///
+/// # Panics
+/// When `selection` is that of another number of splats.
+pub fn apply_to(draft: &mut Draft, edit: &Edit, selection: &Selection, open: Open) -> Result<Applied, EditError> {
+    assert_eq!(selection.len(), draft.len(), "a selection of the same scene");
+    Ok(Plan::with(draft, edit, Some(selection), open)?.carry_out(draft))
+}
+
 /// An edit that can no longer fail.
 pub(crate) struct Plan {
     edit: Edit,
@@ -122,13 +135,18 @@ impl Change {
 
 impl Plan {
     pub fn new(draft: &Draft, edit: &Edit, open: Open) -> Result<Self, EditError> {
+        Self::with(draft, edit, None, open)
+    }
+
+    /// The plan of an edit whose steps give `known`, if that is known.
+    fn with(draft: &Draft, edit: &Edit, known: Option<&Selection>, open: Open) -> Result<Self, EditError> {
         edit.check()?;
         let mut edit = edit.clone();
         let n = draft.len();
         let selection = match (&edit.op, &edit.select) {
             (Operation::Show {}, steps) => among(draft, &draft.hidden, steps.as_deref())?,
             (Operation::Unlock {}, steps) => among(draft, &draft.locked, steps.as_deref())?,
-            (_, Some(steps)) => select(draft, steps)?,
+            (_, Some(steps)) => known.map_or_else(|| select(draft, steps), |known| Ok(known.clone()))?,
             // Hidden and locked splats move with the whole scene.
             (
                 Operation::Move { .. }

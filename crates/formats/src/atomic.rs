@@ -6,7 +6,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Writes a file atomically: under a temporary name in the same folder, synced to the disk, then renamed to `path`. If
 /// anything fails, or the process is killed, the previous content of `path` is unchanged. A symbolic link is kept, and the file that
-/// it leads to is replaced; anything that is not a regular file, such as a pipe or `/dev/stdout`, is written to directly.
+/// it leads to is replaced; anything that is not a regular file, such as a pipe or `/dev/stdout`, is written to directly. Missing folders
+/// are created.
 ///
 /// # Errors
 /// [`FormatError::Write`] with the system's reason, such as a full disk; the temporary file is removed.
@@ -23,6 +24,9 @@ fn write_beside(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Result<()
         let mut writer = BufWriter::with_capacity(1 << 18, OpenOptions::new().write(true).open(path)?);
         write(&mut writer)?;
         return writer.flush();
+    }
+    if let Some(folder) = path.parent().filter(|folder| !folder.as_os_str().is_empty()) {
+        fs::create_dir_all(folder)?;
     }
     let (temporary, file) = Temporary::beside(path)?;
     let mut writer = BufWriter::with_capacity(1 << 18, file);
@@ -125,6 +129,8 @@ mod tests {
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
         write_atomic(&path, |w| w.write_all(b"second")).unwrap();
         assert_eq!(fs::read(&path).unwrap(), b"second");
-        assert!(write_atomic(&folder.path().join("none/a.bin"), |_| Ok(())).is_err());
+        // Missing folders are created, but not below a file.
+        write_atomic(&folder.path().join("new/a.bin"), |_| Ok(())).unwrap();
+        assert!(write_atomic(&path.join("a.bin"), |_| Ok(())).is_err());
     }
 }

@@ -25,6 +25,22 @@ pub struct Pixels {
     pub data: Vec<u8>,
 }
 
+impl Pixels {
+    /// The pixels without their alpha, if all of it is opaque.
+    pub(crate) fn without_opaque_alpha(mut self) -> Self {
+        if self.channels == 4 && self.data.chunks_exact(4).all(|pixel| pixel[3] == 255) {
+            self.channels = 3;
+            self.data = self
+                .data
+                .chunks_exact(4)
+                .flat_map(|pixel| &pixel[..3])
+                .copied()
+                .collect();
+        }
+        self
+    }
+}
+
 /// The header of an image file, read before its pixels are decoded.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Header {

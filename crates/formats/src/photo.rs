@@ -26,6 +26,9 @@ pub(crate) struct PhotoFile {
     pub shown: Option<Shown>,
     /// Size of the resulting photograph.
     pub size: (u32, u32),
+    /// Whether alpha counts even if all of it is opaque, as in rendered scenes. Otherwise such a photograph is one without alpha: programs
+    /// that write screenshots and frames add the channel without a meaning.
+    pub keeps_alpha: bool,
 }
 
 impl PhotoSource for PhotoFile {
@@ -88,6 +91,10 @@ impl PhotoFile {
                 ),
             ));
         }
+        let pixels = match self.keeps_alpha {
+            true => pixels,
+            false => pixels.without_opaque_alpha(),
+        };
         let pixels = self.bring_to_size(pixels, self.part(divisor), size);
         let mut mask = self
             .mask
@@ -152,6 +159,7 @@ impl PhotoFile {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::write_png;
     use irradia_scene::{Intrinsics, Lens};
 
     #[test]
@@ -178,6 +186,7 @@ mod tests {
                 undistortion,
                 shown: None,
                 size: (960, 672),
+                keeps_alpha: false,
             };
             let (file, whole) = (photo(true), photo(false));
             assert!([(960, 672), (480, 336), (240, 168)].map(|size| file.divisor(size)) == [2, 4, 8]);
@@ -238,6 +247,7 @@ mod tests {
                     undistortion,
                     shown: None,
                     size: (upright.0 / 9, upright.1 / 9),
+                    keeps_alpha: false,
                 };
                 let (file, whole) = (photo(true), photo(false));
                 assert_eq!((file.divisor(file.size), whole.divisor(whole.size)), (8, 1));
@@ -248,5 +258,29 @@ mod tests {
                 assert!(mean < 1.5, "{orientation:?}: {mean}");
             }
         }
+    }
+
+    #[test]
+    fn opaque_alpha_counts_only_in_rendered_scenes() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.png");
+        let channels = |alpha: u8, keeps_alpha: bool| {
+            write_png(&path, 2, 1, 4, &[9, 8, 7, 255, 6, 5, 4, alpha]).unwrap();
+            let photo = PhotoFile {
+                image: path.clone(),
+                mask: None,
+                orientation: Orientation::NoTransforms,
+                jpeg: false,
+                upright: (2, 1),
+                undistortion: None,
+                shown: None,
+                size: (2, 1),
+                keeps_alpha,
+            };
+            let photo = photo.load().unwrap();
+            (photo.channels, photo.data)
+        };
+        assert_eq!(channels(255, false), (3, vec![9, 8, 7, 6, 5, 4]));
+        assert_eq!((channels(255, true).0, channels(254, false).0), (4, 4));
     }
 }

@@ -3,7 +3,7 @@
 use crate::folder::cameras_beside;
 use crate::levels::write_scene;
 use crate::orbit::orbit;
-use crate::{RunError, check_kept, scene_of};
+use crate::{RunError, check_kept, residual_left_out, scene_of};
 use irradia_formats::{SplatFormat, WriteOptions, read_splat_file, read_splats, splat_file_size};
 use irradia_measure::psnr;
 use irradia_scene::{GaussianCloud, Similarity};
@@ -45,6 +45,7 @@ pub fn convert(input: &Path, output: &Path, options: &WriteOptions, compares: bo
     let file = read_splat_file(&input)?;
     let before = splat_file_size(&input)?;
     let mut notes = file.warnings();
+    notes.extend(residual_left_out(&input, "splat formats cannot hold it"));
     notes.extend(write_scene(output, &file.cloud, options)?);
     let is_compared = compares && to.is_readable() && !to.is_lossless();
     Ok(Conversion {

@@ -1,11 +1,11 @@
 //! Edits of a scene on disk: read the scene, apply a list of edits, write the result.
 
-use crate::folder::{SKY, VIGNETTE, cameras_beside, cameras_moved};
+use crate::folder::{SKY, VIGNETTE, cameras_beside, cameras_moved, write_own_cameras};
 use crate::levels::write_scene;
 use crate::lock::FolderLock;
 use crate::photographs::photographs_of;
 use crate::scene_file::{check_kept, is_field, same_file};
-use crate::{RunError, RunFolder, SCENE, Scene, scene_of, write_image};
+use crate::{RunError, RunFolder, SCENE, Scene, residual_left_out, scene_of, write_image};
 use irradia_edit::{Applied, Draft, Edit, EditList, Provenance, Transform, apply};
 use irradia_formats::{SplatFormat, WriteOptions, read_splat_file, write_atomic, write_splats, write_splats_with};
 use irradia_scene::GaussianCloud;
@@ -155,18 +155,16 @@ impl Editing {
                 }
             }
             folder.write(EDITS, self.list.to_toml().as_bytes())?;
-            if self.path.with_file_name(crate::RESIDUAL).is_file() {
-                notes.push(format!(
-                    "{} is left out: it belongs to the scene before the edit",
-                    crate::RESIDUAL
-                ));
-            }
         }
+        notes.extend(residual_left_out(&self.path, "it belongs to the scene before the edit"));
         for (path, cloud) in &splits {
             notes.extend(write_splats_with(path, cloud, options)?);
             notes.push(format!("{}: {} splats split off", path.display(), cloud.len()));
         }
         notes.extend(write_scene(&file, &self.draft.shown(), options)?);
+        if is_file {
+            write_own_cameras(&self.path, &file, &self.moved)?;
+        }
         match self.draft.hidden.count() {
             0 => {}
             hidden => notes.push(format!("{hidden} hidden splats left out")),

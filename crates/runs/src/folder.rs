@@ -132,8 +132,15 @@ impl RunFolder {
     /// Checks that a new run may be created at `path`, before any work is done for it.
     ///
     /// # Errors
-    /// When it already contains a run and `overwrite` is not set, or is a file.
+    /// When it already contains a run and `overwrite` is not set, is in use, or is a file.
     pub fn check_free(path: &Path, overwrite: bool) -> Result<(), RunError> {
+        Self::check_replaceable(path, overwrite)?;
+        // Before photographs are posed into the folder of a run that is training.
+        FolderLock::take_existing(path).map(drop)
+    }
+
+    /// As [`Self::check_free`], whoever holds the folder.
+    fn check_replaceable(path: &Path, overwrite: bool) -> Result<(), RunError> {
         if path.exists() && !path.is_dir() {
             return Err(RunError::Refused(format!(
                 "{} is a file: name a folder with --out",
@@ -168,7 +175,7 @@ impl RunFolder {
             Some(lock) => lock,
             None => FolderLock::take(path)?,
         };
-        Self::check_free(path, overwrite)?;
+        Self::check_replaceable(path, overwrite)?;
         if FILES.iter().any(|file| path.join(file).exists()) {
             for folder in FOLDERS.map(|folder| path.join(folder)) {
                 if folder.exists() {
@@ -253,17 +260,41 @@ impl RunFolder {
         self.write(VIEWS, &to_json(&ViewList::of(dataset)))
     }
 
-    /// Differences between `dataset` and the one with which the run began; empty if the run has no list.
-    pub(crate) fn changed_views(&self, dataset: &Dataset) -> Result<Vec<String>, RunError> {
+    /// The views with which the run began; `None` if the run has no list.
+    fn views(&self) -> Result<Option<ViewList>, RunError> {
         let path = self.file(VIEWS);
         let Ok(text) = fs::read_to_string(&path) else {
-            return Ok(Vec::new());
+            return Ok(None);
         };
-        let then: ViewList = serde_json::from_str(&text).map_err(|error| RunError::Damaged {
+        let views = serde_json::from_str(&text).map_err(|error| RunError::Damaged {
             path,
             reason: error.to_string(),
         })?;
-        Ok(then.differences(&ViewList::of(dataset)))
+        Ok(Some(views))
+    }
+
+    /// Differences between `dataset` and the one with which the run began; empty if the run has no list.
+    pub(crate) fn changed_views(&self, dataset: &Dataset) -> Result<Vec<String>, RunError> {
+        let then = self.views()?;
+        Ok(then.map_or_else(Vec::new, |then| then.differences(&ViewList::of(dataset))))
+    }
+
+    /// Holds out those views of `dataset` that the run held out, by their names, even if the dataset has gained or lost photographs since:
+    /// every N-th view would be another one. A dataset of other photographs keeps its own split.
+    ///
+    /// # Errors
+    /// When the run's list of views is damaged.
+    pub fn hold_out_again(&self, dataset: &mut Dataset) -> Result<(), RunError> {
+        if let Some(missing) = self
+            .views()?
+            .and_then(|views| views.split(dataset))
+            .filter(|missing| *missing > 0)
+        {
+            dataset
+                .warnings
+                .push(format!("{missing} views that the run held out are not in the dataset"));
+        }
+        Ok(())
     }
 
     /// The recorded paces of the run's steps.
@@ -436,9 +467,46 @@ pub(crate) fn world_beside(scene: &Path) -> Result<Similarity, RunError> {
     RunFolder(scene.parent().unwrap_or(Path::new("")).to_owned()).world_from_dataset()
 }
 
+/// The file of the cameras of the scene `scene` alone, such as `scene.edited.cameras.json`. It exists if the scene was moved away from the
+/// photographs of its run, and the cameras with it.
+fn own_cameras(scene: &Path) -> PathBuf {
+    scene.with_extension("cameras.json")
+}
+
+/// Whether the file `scene` was moved away from the photographs of the run whose folder contains it.
+pub fn is_moved(scene: &Path) -> bool {
+    own_cameras(scene).is_file()
+}
+
+/// The file of the cameras of `scene`.
+fn cameras_file(scene: &Path) -> PathBuf {
+    Some(own_cameras(scene))
+        .filter(|own| own.is_file())
+        .unwrap_or_else(|| scene.with_file_name("cameras.json"))
+}
+
+/// Writes the cameras of the scene `to`, in the folder of a run: those of `from`, after moving the whole scene in the dataset's coordinates.
+/// A scene that was not moved has no file of its own.
+///
+/// # Errors
+/// When the file cannot be written or removed.
+pub fn write_own_cameras(from: &Path, to: &Path, moved: &Transform) -> Result<(), RunError> {
+    let file = own_cameras(to);
+    let is_in_run = to.with_file_name("cameras.json").is_file();
+    let text = match is_in_run && (is_moved(from) || !moved.is_identity()) {
+        true => cameras_moved(from, moved),
+        false => None,
+    };
+    match text {
+        Some(text) => Ok(write_atomic(&file, |out| out.write_all(&text))?),
+        None if is_in_run && file.is_file() => fs::remove_file(&file).map_err(RunError::io("remove", &file)),
+        None => Ok(()),
+    }
+}
+
 /// The cameras of the run that contains the file `scene`, if there is one, in the world of `world_from_dataset`.
 pub(crate) fn cameras_beside(scene: &Path, world_from_dataset: &Similarity) -> Option<Vec<Camera>> {
-    let text = fs::read_to_string(scene.parent()?.join("cameras.json")).ok()?;
+    let text = fs::read_to_string(cameras_file(scene)).ok()?;
     let records: Vec<CameraRecord> = serde_json::from_str(&text).ok()?;
     let camera = |r: &CameraRecord| {
         let [w, x, y, z] = r.rotation;
@@ -457,14 +525,14 @@ pub(crate) fn cameras_beside(scene: &Path, world_from_dataset: &Similarity) -> O
 
 /// The names of the views of [`cameras_beside`].
 pub(crate) fn camera_names_beside(scene: &Path) -> Option<Vec<String>> {
-    let text = fs::read_to_string(scene.with_file_name("cameras.json")).ok()?;
+    let text = fs::read_to_string(cameras_file(scene)).ok()?;
     let records: Vec<CameraRecord> = serde_json::from_str(&text).ok()?;
     Some(records.into_iter().map(|record| record.name).collect())
 }
 
 /// The content of `cameras.json` beside the file `scene`, if there is one, after moving the whole scene in the dataset's coordinates.
 pub(crate) fn cameras_moved(scene: &Path, moved: &Transform) -> Option<Vec<u8>> {
-    let text = fs::read(scene.with_file_name("cameras.json")).ok()?;
+    let text = fs::read(cameras_file(scene)).ok()?;
     if moved.is_identity() {
         return Some(text);
     }

@@ -73,7 +73,7 @@ pub use describe::describe;
 pub use edit::{EDITS, Editing, Made};
 pub use error::RunError;
 pub use evaluate::{distinct, evaluate, file_stem, file_stems, unmeasured};
-pub use folder::{FIELD, RESIDUAL, RunFolder, RunRecord, SCENE};
+pub use folder::{FIELD, RESIDUAL, RunFolder, RunRecord, SCENE, is_moved, write_own_cameras};
 pub use irradia_formats as formats;
 pub use irradia_scene as scene;
 pub use irradia_synth as synth;
@@ -93,7 +93,7 @@ pub use provenance::{data_fingerprint, program_fingerprint};
 pub use request::{DEFAULT_RECIPE, HOW_TO_GET_LPIPS, Reading, TrainInput, TrainRequest, read_recipe};
 pub use results::write_image;
 pub use run::{Finished, Run, open_device};
-pub use scene_file::{Scene, check_kept, read_lights, read_vignette, scene_of};
+pub use scene_file::{Scene, check_kept, read_lights, read_vignette, residual_left_out, scene_of};
 pub use snapshot::{Snapshot, Snapshots};
 pub use synth_files::{SynthSummary, write_synth_dataset};
 

@@ -1,6 +1,6 @@
 //! Reduced photographs of a run, for the search for floaters.
 
-use crate::folder::camera_names_beside;
+use crate::folder::{camera_names_beside, is_moved};
 use crate::scene_file::render_knobs_beside;
 use crate::{RunFolder, TrainInput};
 use irradia_edit::{Photographs, Taken};
@@ -13,9 +13,10 @@ const SIDE: f32 = 480.0;
 /// Maximum number of photographs, spread evenly over the cameras.
 const MOST: usize = 24;
 
-/// The photographs on which the scene `scene` was trained, if it is in its run's folder and they are still in place.
+/// The photographs on which the scene `scene` was trained, if it is in its run's folder, was not moved away from them, and they are still
+/// in place.
 pub fn photographs_of(scene: &Path) -> Option<Photographs> {
-    RunFolder::containing(scene)?;
+    RunFolder::containing(scene).filter(|_| !is_moved(scene))?;
     let scene = scene.to_owned();
     Some(Photographs::new(move || read(&scene)))
 }

@@ -38,6 +38,22 @@ impl ViewList {
         Self(dataset.views.iter().zip(parts).map(record).collect())
     }
 
+    /// Splits `dataset` as before: views of these names are held out again, and all others are trained on. Returns how many of the views
+    /// that were held out are missing; `None` if no name is known, in which case nothing changes.
+    pub fn split(&self, dataset: &mut Dataset) -> Option<usize> {
+        let part = |view: usize| self.0.get(&dataset.views[view].name).map(|record| record.part);
+        let views = || 0..dataset.views.len();
+        views().find_map(part)?;
+        let test: Vec<usize> = views().filter(|view| part(*view) == Some(Part::Test)).collect();
+        let train = views()
+            .filter(|view| !matches!(part(*view), Some(Part::Test | Part::Neither)))
+            .collect();
+        let held_out = self.0.values().filter(|record| record.part == Part::Test).count();
+        let missing = held_out - test.len();
+        (dataset.train, dataset.test) = (train, test);
+        Some(missing)
+    }
+
     /// Differences from `now`: one phrase per kind of difference, each with the first view concerned.
     pub fn differences(&self, now: &Self) -> Vec<String> {
         let told = |what: &str, names: Vec<&String>| {

@@ -1,7 +1,7 @@
 //! Training requests: raw input, and the validated request.
 
 use crate::pose::{are_missing, find_points};
-use crate::{Background, RunError, RunFolder, scene_of};
+use crate::{Background, RunError, RunFolder, is_moved, scene_of};
 use irradia_compute::DeviceChoice;
 use irradia_formats::{
     DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, Lenses, Readout, read_dataset, read_splats,
@@ -504,6 +504,12 @@ impl TrainRequest {
     pub(crate) fn first_splats(&self, dataset: &Dataset) -> Result<Option<(Splats, bool)>, RunError> {
         let Some(from) = &self.input.from else { return Ok(None) };
         let path = scene_of(from);
+        if is_moved(&path) {
+            return Err(RunError::Refused(format!(
+                "{} was moved away from its photographs: start from a scene whose edits do not move all of it",
+                path.display()
+            )));
+        }
         let mut cloud = read_splats(&path)?;
         if cloud.is_empty() {
             return Err(RunError::Refused(format!(

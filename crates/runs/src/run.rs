@@ -77,7 +77,13 @@ impl Run {
     ///
     /// # Errors
     /// Those of [`Run::begin`].
-    pub fn begin_on(mut request: TrainRequest, dataset: Dataset) -> Result<Self, RunError> {
+    pub fn begin_on(mut request: TrainRequest, mut dataset: Dataset) -> Result<Self, RunError> {
+        if let (Some(from), None) = (&request.input.from, &request.input.reading.holdout)
+            && let Some(run) = RunFolder::containing(from)
+        {
+            // The splats were trained on all others.
+            run.hold_out_again(&mut dataset)?;
+        }
         if dataset.test.is_empty()
             && let Some(psnr) = request.input.until_psnr
         {
@@ -123,8 +129,11 @@ impl Run {
     ///
     /// # Errors
     /// Those of [`Run::resume`].
-    pub fn resume_on(request: TrainRequest, dataset: Dataset) -> Result<Self, RunError> {
+    pub fn resume_on(request: TrainRequest, mut dataset: Dataset) -> Result<Self, RunError> {
         let (folder, _) = RunFolder::open(&request.input.out)?;
+        if request.input.from.is_some() && request.input.reading.holdout.is_none() {
+            folder.hold_out_again(&mut dataset)?;
+        }
         let lock = FolderLock::take(folder.path())?;
         folder.remove_leftovers()?;
         let options = train_options(&request)?;
@@ -253,7 +262,7 @@ impl Run {
         self.write_scene()?;
         saved?;
         let report = self.report(finishing, stop);
-        if matches!(report, Err(RunError::EvaluationStopped)) && self.trainer.finished() {
+        if report.is_err() && self.trainer.finished() {
             self.journal.save_now(&self.trainer)?;
         }
         let report = report?;

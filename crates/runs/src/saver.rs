@@ -186,6 +186,7 @@ mod tests {
         assert_eq!((saver.take_saved(), saver.take_failure()), (None, None));
 
         std::fs::remove_dir_all(run.folder.file("checkpoints")).unwrap();
+        std::fs::write(run.folder.file("checkpoints"), "").unwrap();
         saver.save_behind(&run.folder, &checkpoint);
         saver.wait();
         assert_eq!(saver.take_saved(), None);

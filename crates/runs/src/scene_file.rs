@@ -1,8 +1,8 @@
 //! A scene that can be rendered: read from a file or a run, or taken from a training.
 
-use crate::RunError;
 use crate::folder::{APPEARANCE, EXPOSURES, FIELD, RESIDUAL, SCENE, SKY, VIGNETTE, cameras_beside, world_beside};
 use crate::orbit::{Outlook, orbit, outlook};
+use crate::{RunError, RunFolder};
 use irradia_edit::Draft;
 use irradia_field::{Field, Sampler};
 use irradia_formats::{SplatFormat, is_sog_folder, read_splat_file};
@@ -123,7 +123,9 @@ pub fn scene_of(path: &Path) -> PathBuf {
 /// When `output` is `scene`, or the scene's file in that folder.
 pub fn check_kept(scene: &Path, output: &Path) -> Result<(), RunError> {
     let scene = scene_of(scene);
-    match same_file(output, &scene) {
+    // A folder of SOG images is written as its list.
+    let list = output.join(SplatFormat::SogFolder.suffix());
+    match same_file(output, &scene) || same_file(&list, &scene) {
         true => Err(RunError::Refused(format!(
             "{} would be replaced: name another output",
             scene.display()
@@ -172,25 +174,33 @@ fn read_model(path: &Path) -> Result<(Model<'static>, bool, Similarity, Vec<Stri
     Ok((model, cloud.antialiased, cloud.world_from_dataset, notes))
 }
 
+/// The file `name` in the folder of a run, for any scene in it: what lenses do, and what is behind the scene, survive edits.
+fn of_run(scene: &Path, name: &str) -> Option<PathBuf> {
+    let path = scene.with_file_name(name);
+    (RunFolder::containing(scene).is_some() || scene.file_name().is_some_and(|name| name == SCENE))
+        .then_some(path)
+        .filter(|path| path.is_file())
+}
+
 /// The file `name` beside the scene of a run, if there is one.
 fn beside(scene: &Path, name: &str) -> Option<PathBuf> {
     let path = scene.with_file_name(name);
     (scene.file_name().is_some_and(|name| name == SCENE) && path.is_file()).then_some(path)
 }
 
-/// The bytes of the file `name` beside the scene of a run, if there is one.
-fn bytes_beside(scene: &Path, name: &str) -> Result<Option<Vec<u8>>, RunError> {
+/// The bytes of a file, if there is one.
+fn bytes_of(file: Option<PathBuf>) -> Result<Option<Vec<u8>>, RunError> {
     let read = |path: PathBuf| fs::read(&path).map_err(RunError::io("read", &path));
-    beside(scene, name).map(read).transpose()
+    file.map(read).transpose()
 }
 
-/// The file `name` beside the scene of a run, if there is one, parsed by `parse`.
-fn parsed_beside<T>(
+/// The file `name` in the folder of a run, if there is one, parsed by `parse`.
+fn parsed_of_run<T>(
     scene: &Path,
     name: &str,
     parse: impl FnOnce(&[u8]) -> Result<T, String>,
 ) -> Result<Option<T>, RunError> {
-    let parsed = bytes_beside(scene, name)?.map(|bytes| parse(&bytes)).transpose();
+    let parsed = bytes_of(of_run(scene, name))?.map(|bytes| parse(&bytes)).transpose();
     parsed.map_err(|why| RunError::File {
         path: scene.with_file_name(name),
         source: TrainError::Checkpoint(why),
@@ -202,13 +212,21 @@ pub(crate) fn residual_beside(scene: &Path) -> Result<Option<Field>, RunError> {
     beside(scene, RESIDUAL).as_deref().map(read_field).transpose()
 }
 
+/// A note if the scene `scene` has a residual field, which is left out for the reason `why`.
+pub fn residual_left_out(scene: &Path, why: &str) -> Option<String> {
+    beside(scene, RESIDUAL).map(|_| format!("{RESIDUAL} is left out: {why}"))
+}
+
 /// The light of each photograph of the run whose scene is the file `scene`, if the run has learned it. The scene itself is shown in
 /// the mean light.
 ///
 /// # Errors
 /// When one of their files cannot be read, or the files do not belong together.
 pub fn read_lights(scene: &Path) -> Result<Option<Lights>, RunError> {
-    let [exposures, appearance] = [bytes_beside(scene, EXPOSURES)?, bytes_beside(scene, APPEARANCE)?];
+    let [exposures, appearance] = [
+        bytes_of(beside(scene, EXPOSURES))?,
+        bytes_of(beside(scene, APPEARANCE))?,
+    ];
     Lights::from_files(exposures.as_deref(), appearance.as_deref()).map_err(|source| RunError::File {
         path: scene.to_owned(),
         source,
@@ -220,12 +238,12 @@ pub fn read_lights(scene: &Path) -> Result<Option<Lights>, RunError> {
 /// # Errors
 /// When its file cannot be read.
 pub fn read_vignette(scene: &Path) -> Result<Option<Vignette>, RunError> {
-    parsed_beside(scene, VIGNETTE, Vignette::from_file)
+    parsed_of_run(scene, VIGNETTE, Vignette::from_file)
 }
 
 /// The mean colour of the sky beside `scene`, if there is one.
 fn sky_beside(scene: &Path) -> Result<Option<[f32; 3]>, RunError> {
-    parsed_beside(scene, SKY, background_of_sky)
+    parsed_of_run(scene, SKY, background_of_sky)
 }
 
 /// Background and antialiasing of the run that contains `scene`; the defaults if there is no run.

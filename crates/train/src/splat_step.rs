@@ -48,8 +48,17 @@ impl Trainer {
             depth: plan.compares_depth(),
             ..usual
         };
-        let depth_map = self.given_depths(view, &camera, &plan);
-        let normal_map = self.given_normals(view, &camera, &plan);
+        let mut depth_map = self.given_depths(view, &camera, &plan);
+        let mut normal_map = self.given_normals(view, &camera, &plan);
+        if let Some(mask) = &photo.mask {
+            // Maps also show what is masked, such as people in front of the scene.
+            if let Some((samples, _)) = &mut depth_map {
+                samples.retain(|sample| mask[sample.pixel as usize] > 0);
+            }
+            if let Some((samples, _)) = &mut normal_map {
+                samples.retain(|sample| mask[(sample.pixel[1] * photo.width + sample.pixel[0]) as usize] > 0);
+            }
+        }
         let reference = Reference {
             photo: &photo,
             background,

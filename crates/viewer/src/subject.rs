@@ -7,7 +7,9 @@ use crate::live::{Live, Watcher};
 use crate::views::Views;
 use irradia_edit::Transform;
 use irradia_runs::formats::Lenses;
-use irradia_runs::{Reading, Run, RunFolder, Scene, Snapshot, TrainInput, read_levels, read_lights, scene_of};
+use irradia_runs::{
+    Reading, Run, RunFolder, Scene, Snapshot, TrainInput, is_moved, read_levels, read_lights, scene_of,
+};
 use irradia_scene::Dataset;
 use irradia_splat::Splats;
 use irradia_splat::init::{InitOptions, from_points};
@@ -101,6 +103,11 @@ impl Subject {
             }
             return Ok(Self::of_dataset(path, reading.read(path)?));
         }
+        let recipe = folder
+            .as_ref()
+            .and_then(|folder| std::fs::read_to_string(folder.file("recipe.toml")).ok());
+        // A scene that was moved away from its photographs has another unit as well.
+        let folder = folder.filter(|_| !is_moved(&file));
         let mut scene = Scene::read(&file)?;
         let mut warnings = std::mem::take(&mut scene.notes);
         let dataset = match (data, &folder) {
@@ -128,9 +135,6 @@ impl Subject {
             None
         });
         let lights = lights.filter(|lights| lights.views() == views.0.len());
-        let recipe = folder
-            .as_ref()
-            .and_then(|folder| std::fs::read_to_string(folder.file("recipe.toml")).ok());
         let levels = match &scene.model {
             Model::Splats { splats, residual: None } => read_levels(&file, splats.len()),
             _ => Ok(Vec::new()),

@@ -1,5 +1,5 @@
-//! Selections by neighbourhood: growing, connection and clusters. They work on the cells of a grid, so that the cost is linear in the
-//! number of splats.
+//! Selections by neighbourhood: growing, connection and clusters. The last two work on the cells of a grid, so that the cost is linear in
+//! the number of splats.
 
 use crate::{Draft, Selection};
 use glam::DVec3;
@@ -26,19 +26,18 @@ fn around(cell: Cell) -> impl Iterator<Item = Cell> {
     })
 }
 
-/// The selection, and all splats within `by` of it.
+/// The selection, and all splats within `by` of it, dataset units. A search for the nearest selected splat takes as long for any distance,
+/// whereas cells of side `by` may each contain most of the selection.
 pub(super) fn grown(draft: &Draft, selected: &Selection, by: f64) -> Selection {
-    let mut cells: HashMap<Cell, Vec<DVec3>> = HashMap::new();
-    for i in selected.indices() {
-        let position = draft.position(i as usize);
-        cells.entry(cell_of(position, by)).or_default().push(position);
+    if selected.is_empty() {
+        return selected.clone();
     }
-    Selection::of(draft.len(), |i| {
-        let position = draft.position(i);
-        let mut near = around(cell_of(position, by))
-            .filter_map(|cell| cells.get(&cell))
-            .flatten();
-        selected.contains(i) || near.any(|other| other.distance(position) <= by)
+    let means = &draft.cloud.means;
+    let seeds: Vec<[f32; 3]> = selected.indices().iter().map(|i| means[*i as usize]).collect();
+    let tree = Nearest::new(&seeds);
+    let by = by * draft.cloud.world_from_dataset.scale;
+    Selection::of(means.len(), |i| {
+        selected.contains(i) || f64::from(tree.of::<1>(means[i])[0].0).sqrt() <= by
     })
 }
 

@@ -1,10 +1,10 @@
 use crate::{cameras, cloud, draft};
-use irradia_edit::{Draft, Mode, SelectStep, Selection, Shape, Viewpoint, select};
-use irradia_scene::{GaussianCloud, sh};
+use irradia_edit::{Draft, Edit, Mode, SelectStep, Selection, Shape, Viewpoint, apply_to, open_nothing, select};
+use irradia_scene::{GaussianCloud, Similarity, sh};
 use irradia_splat::logit;
 
 fn selected(draft: &Draft, words: &str) -> Selection {
-    let edit: irradia_edit::Edit = format!("delete {words}")
+    let edit: Edit = format!("delete {words}")
         .parse()
         .unwrap_or_else(|e| panic!("{words}: {e}"));
     select(draft, &edit.select.unwrap()).unwrap_or_else(|e| panic!("{words}: {e}"))
@@ -101,6 +101,37 @@ fn growing_finds_exactly_what_is_near() {
         let near = seed.indices().iter().any(|j| distance(i, *j as usize) <= 0.15);
         assert_eq!(grown.contains(i), near, "{i}");
     }
+    let far = selected(&scene, "sphere center=0,0,0 radius=0.4 grow by=100");
+    assert_eq!(far, Selection::all(400));
+    assert!(selected(&scene, "sphere center=9,0,0 radius=0.4 grow by=100").is_empty());
+    // Distances are in the dataset's coordinates.
+    let mut line = at(&[[0.0; 3], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [3.0, 0.0, 0.0]]);
+    line.cloud.world_from_dataset = Similarity {
+        scale: 2.0,
+        center: glam::DVec3::new(10.0, 0.0, 0.0),
+    };
+    let near = selected(&line, "sphere center=10,0,0 radius=0.1 grow by=1.1");
+    assert_eq!(near.indices(), [0, 1, 2]);
+}
+
+#[test]
+fn a_known_selection_is_not_evaluated_again() {
+    let edit = |line: &str| -> Edit { line.parse().unwrap_or_else(|error| panic!("{line}: {error}")) };
+    for line in [
+        "delete sphere center=0,0,0 radius=0.4",
+        "move by=1,0,0 all",
+        "opacity factor=0.5",
+    ] {
+        let (edit, mut with) = (edit(line), draft(100, 0));
+        let known = select(&with, edit.select.as_deref().unwrap_or_default()).expect("possible");
+        apply_to(&mut with, &edit, &known, &open_nothing).expect("possible");
+        assert!(with == crate::edited(&draft(100, 0), &[line]), "{line}");
+    }
+    // This one needs cameras, unless its result is known.
+    let mut scene = Draft::new(cloud(5, 0, 1), Vec::new());
+    let known = Selection::of(5, |i| i < 2);
+    apply_to(&mut scene, &edit("delete views min=1"), &known, &open_nothing).expect("not evaluated");
+    assert_eq!(scene.len(), 3);
 }
 
 #[test]

@@ -19,6 +19,7 @@ use glam::DQuat;
 use image::metadata::Orientation;
 use irradia_scene::{Camera, Dataset, Intrinsics, Lens, PointCloud, RollingShutter, Similarity, View};
 use rayon::prelude::*;
+use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -99,8 +100,7 @@ pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<D
     }
     views.sort_by(|a, b| a.name.cmp(&b.name));
     let declared = views.len();
-    // Otherwise a copy of a held-out view might be trained on.
-    views.dedup_by(|again, first| again.image.is_some() && again.image == first.image);
+    views = without_repeated(views);
     let named = views.len();
     if named < declared {
         warnings.push(format!(
@@ -167,6 +167,7 @@ pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<D
         max_side,
         world_from_dataset: &world,
         points: points.as_ref(),
+        keeps_alpha: kind == "Blender",
     };
     // Photograph by photograph, so that the faces of one are held out together.
     let mut views = Vec::with_capacity(usable.len());
@@ -187,6 +188,26 @@ pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<D
         kind: kind.to_owned(),
         warnings,
     })
+}
+
+/// One view of each photograph: the first whose name fits the photograph's path best. Otherwise a copy of a held-out view might be
+/// trained on.
+fn without_repeated(views: Vec<DeclaredView>) -> Vec<DeclaredView> {
+    let mut view_of: HashMap<&Path, usize> = HashMap::new();
+    for (i, view) in views.iter().enumerate() {
+        let Some(image) = view.image.as_deref() else { continue };
+        let fit = |view: &DeclaredView| (image.ends_with(&view.name), image.ends_with(view.name_below()));
+        let kept = view_of.entry(image).or_insert(i);
+        if fit(view) > fit(&views[*kept]) {
+            *kept = i;
+        }
+    }
+    let kept: HashSet<usize> = view_of.into_values().collect();
+    let views = views.into_iter().enumerate();
+    views
+        .filter(|(i, view)| view.image.is_none() || kept.contains(i))
+        .map(|(_, view)| view)
+        .collect()
 }
 
 fn probe(view: &DeclaredView, ignores_exif: bool) -> Result<Probed, Skipped> {
@@ -324,6 +345,8 @@ struct Finishing<'a> {
     max_side: Option<u32>,
     world_from_dataset: &'a Similarity,
     points: Option<&'a PointCloud>,
+    /// Whether photographs have alpha even if it is opaque everywhere.
+    keeps_alpha: bool,
 }
 
 impl Finishing<'_> {
@@ -371,6 +394,7 @@ impl Finishing<'_> {
             undistortion: plan,
             shown: probed.shown,
             size: (intrinsics.width, intrinsics.height),
+            keeps_alpha: self.keeps_alpha,
         };
         let map = |path: &Option<PathBuf>| {
             // Maps of a fisheye may hold depths along the axis or distances.
@@ -469,4 +493,37 @@ fn skipped_warnings(views: &[DeclaredView], probed: &[Result<Probed, Skipped>]) 
         })
     };
     Skipped::ALL.into_iter().filter_map(line).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::declared::DeclaredCamera;
+    use super::*;
+
+    #[test]
+    fn of_views_with_the_same_photograph_the_one_named_like_it_is_kept() {
+        let kept = |declared: &[(&str, Option<&str>)]| {
+            let view = |(name, image): &(&str, Option<&str>)| DeclaredView {
+                image: image.map(PathBuf::from),
+                ..DeclaredView::posed(Path::new(""), name, None, None, DeclaredCamera::panorama())
+            };
+            let views = without_repeated(declared.iter().map(view).collect());
+            views.into_iter().map(|view| view.name).collect::<Vec<_>>()
+        };
+        let rig = [
+            ("images/cam0/1.jpg", Some("photos/cam1/1.jpg")),
+            ("images/cam0/2.jpg", Some("photos/2.jpg")),
+            ("images/cam1/1.jpg", Some("photos/cam1/1.jpg")),
+            ("images/cam1/2.jpg", Some("photos/2.jpg")),
+            ("images/cam1/3.jpg", None),
+            ("images/cam2/3.jpg", None),
+        ];
+        let expected = [
+            "images/cam0/2.jpg",
+            "images/cam1/1.jpg",
+            "images/cam1/3.jpg",
+            "images/cam2/3.jpg",
+        ];
+        assert_eq!(kept(&rig), expected);
+    }
 }

@@ -11,6 +11,8 @@ const TEST_LISTS: [&str; 2] = ["test_images.txt", "test.txt"];
 const TRAIN_LISTS: [&str; 2] = ["train_images.txt", "train.txt"];
 /// Folders of these lists: the dataset's own, and the Inria code's location.
 const FOLDERS: [&str; 2] = ["", "sparse/0"];
+/// Maximum number of names in a warning.
+const MAX_NAMES: usize = 3;
 
 /// Selects the views held out of training.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -35,7 +37,9 @@ struct List {
 
 impl List {
     fn parse(file: String, text: &str) -> Self {
+        // Some editors begin a text with a byte order mark.
         let lines = text
+            .trim_start_matches('\u{feff}')
             .lines()
             .map(str::trim)
             .filter(|line| !line.is_empty() && !line.starts_with('#'));
@@ -47,6 +51,22 @@ impl List {
 
     fn has(&self, name: &str) -> bool {
         names_of(name).any(|n| self.names.contains(n))
+    }
+
+    /// The warning about names that match none of the views `names`.
+    fn missing_warning(&self, names: &[String]) -> Option<String> {
+        let known: HashSet<&str> = names.iter().flat_map(|name| names_of(name)).collect();
+        let names = self.names.iter().map(String::as_str);
+        let mut missing: Vec<&str> = names.filter(|name| !known.contains(name)).collect();
+        missing.sort_unstable();
+        let first = missing.iter().take(MAX_NAMES).copied().collect::<Vec<_>>().join(", ");
+        (!missing.is_empty()).then(|| {
+            format!(
+                "{} names in {} are not views of the dataset, such as {first}",
+                missing.len(),
+                self.file
+            )
+        })
     }
 }
 
@@ -100,10 +120,8 @@ pub(super) fn split(
                     names.first().map_or("", String::as_str)
                 )));
             }
-            let missing = list.names.len().saturating_sub(listed.test.len());
             Indices {
-                warning: (missing > 0)
-                    .then(|| format!("{missing} names in {} are not views of the dataset", list.file)),
+                warning: list.missing_warning(names),
                 ..listed
             }
         }
@@ -172,13 +190,14 @@ fn declared(splits: &[Option<Split>]) -> Indices {
 }
 
 /// The forms in which lists may give a view's name: complete or below the folder of images, each with and without the extension,
-/// or its last part without the extension.
+/// or its last part with and without the extension.
 fn names_of(name: &str) -> impl Iterator<Item = &str> {
     let below = name.split_once('/').map_or(name, |(_, below)| below);
+    let last = name.rsplit('/').next().unwrap_or(name);
     let stem = |name| Path::new(name).file_stem().and_then(|s| s.to_str()).unwrap_or(name);
     let bare = name.rsplit_once('.').map_or(name, |(bare, _)| bare);
     let bare_below = below.rsplit_once('.').map_or(below, |(bare, _)| bare);
-    [name, below, bare, bare_below, stem(below)].into_iter()
+    [name, below, bare, bare_below, last, stem(last)].into_iter()
 }
 
 fn read_list(root: &Path, files: [&str; 2]) -> Option<List> {
@@ -216,6 +235,21 @@ mod tests {
             let listed = Holdout::Listed(root.path().join("test.txt"));
             assert_eq!(of(listed, Path::new("elsewhere")), (vec![0, 1, 3], vec![2]));
         }
+    }
+
+    #[test]
+    fn a_file_name_matches_in_any_folder_and_names_without_a_view_are_told() {
+        let root = tempfile::tempdir().unwrap();
+        let file = root.path().join("list.txt");
+        std::fs::write(&file, "\u{feff}1.jpg\nx.jpg\ny\n").unwrap();
+        let names = ["images/cam0/1.jpg", "images/cam1/1.jpg", "images/cam1/2.jpg"].map(String::from);
+        let indices = split(&Holdout::Listed(file), root.path(), &names, vec![None; 3]).unwrap();
+        assert_eq!((indices.train, indices.test), (vec![2], vec![0, 1]));
+        let warning = indices.warning.unwrap();
+        assert!(
+            warning.starts_with("2 names in") && warning.ends_with("such as x.jpg, y"),
+            "{warning}"
+        );
     }
 
     #[test]

@@ -506,24 +506,47 @@ fn encode(
     }
 }
 
+/// Whether the origin of the cloud's world is too far from that of the dataset for positions in `f32`: more than 200 times the median
+/// distance of the splats from it, at which the precision is a hundred-thousandth of that distance.
+fn is_far(cloud: &GaussianCloud) -> bool {
+    let world = cloud.world_from_dataset;
+    if world.center == glam::DVec3::ZERO {
+        return false;
+    }
+    let mut distances: Vec<f32> = cloud
+        .means
+        .iter()
+        .map(|mean| glam::Vec3::from(*mean).length())
+        .filter(|distance| distance.is_finite())
+        .collect();
+    let at = distances.len() / 2;
+    let median = match distances.is_empty() {
+        true => 0.0,
+        false => *distances.select_nth_unstable_by(at, f32::total_cmp).1,
+    };
+    world.center.length() > 200.0 * f64::from(median) / world.scale
+}
+
 /// The splats that can be drawn, in the dataset's coordinates, relative to the origin of its world if that is far away: formats other
 /// than PLY hold neither doubles nor a second coordinate system.
 fn prepared<'a>(cloud: &'a GaussianCloud, notes: &mut Vec<String>) -> Cow<'a, GaussianCloud> {
     let mut cloud = Cow::Borrowed(cloud);
     let world = cloud.world_from_dataset;
     if !world.is_identity() {
+        let is_far = is_far(&cloud);
+        let origin = if is_far { glam::DVec3::ZERO } else { world.center };
         let own = cloud.to_mut();
         let (unit, log_unit) = (1.0 / world.scale, world.scale.ln());
-        own.means
-            .as_flattened_mut()
-            .iter_mut()
-            .for_each(|v| *v = (f64::from(*v) * unit) as f32);
+        for mean in &mut own.means {
+            let position = glam::DVec3::from(mean.map(f64::from)) * unit + origin;
+            *mean = position.as_vec3().to_array();
+        }
         own.log_scales
             .as_flattened_mut()
             .iter_mut()
             .for_each(|v| *v = (f64::from(*v) - log_unit) as f32);
         own.world_from_dataset = Similarity::IDENTITY;
-        if world.center != glam::DVec3::ZERO {
+        if is_far {
             let glam::DVec3 { x, y, z } = world.center;
             notes.push(format!(
                 "positions are relative to ({x}, {y}, {z}), which is too far from the origin for floats"

@@ -226,7 +226,7 @@ pub(crate) fn write_splat_ply(out: &mut dyn Write, cloud: &GaussianCloud) -> io:
         let [x, y, z] = world.center.to_array();
         writeln!(out, "comment {WORLD} {} {x} {y} {z}", world.scale)?;
     }
-    let doubles = world.center != DVec3::ZERO;
+    let doubles = super::is_far(cloud);
     writeln!(out, "element vertex {}", cloud.len())?;
     for name in &names {
         let scalar = if doubles && POSITION.contains(&name.as_str()) {

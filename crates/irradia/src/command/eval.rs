@@ -81,7 +81,6 @@ pub fn run(args: &Args) -> Result<()> {
     let run = RunFolder::around(&args.scene);
     let mut reading = args.reading.clone();
     if reading.holdout.is_none() {
-        // The run was trained on all views except those that it held out.
         reading.holdout = run.as_ref().and_then(|record| record.input.reading.holdout.clone());
     }
     if reading.lenses.is_none() {
@@ -96,7 +95,12 @@ pub fn run(args: &Args) -> Result<()> {
         reading.downscale = Some(of_run.downscale).filter(|factor| *factor > 1.0);
         reading.full_size = reading.max_side.is_none() && reading.downscale.is_none();
     }
-    let dataset = scene.place(reading.read(&args.data)?);
+    let mut dataset = reading.read(&args.data)?;
+    if let (None, Some(folder)) = (&args.reading.holdout, RunFolder::containing(&args.scene)) {
+        // The run was trained on all others.
+        folder.hold_out_again(&mut dataset)?;
+    }
+    let dataset = scene.place(dataset);
     let background = match (args.background, &run) {
         (None, None) if !has_background(&args.scene) => Background::usual(&dataset, false)?,
         (given, _) => given,

@@ -124,9 +124,16 @@ pub fn pose_first(input: &mut TrainInput, poses: Poses, anyway: bool) -> Result<
             true => format!(" see {};", doctor.display()),
             false => String::new(),
         };
+        // Poses by COLMAP would be compared with the photographs first.
+        let given = if poses == Poses::Colmap { " --poses given" } else { "" };
+        let overwrite = if input.overwrite { " --overwrite" } else { "" };
         return Err(Usage(format!(
-            "only {} of {} photographs have poses:{first}{see} add photographs between them and the others, or train --anyway",
-            report.registered, report.photos,
+            "only {} of {} photographs have poses:{first}{see} add photographs between them and the others, or train --anyway, or without \
+             posing again: irradia train {} --out {}{given}{overwrite}",
+            report.registered,
+            report.photos,
+            posed.display(),
+            input.out.display(),
         ))
         .into());
     }
@@ -164,18 +171,20 @@ pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses, anywa
         ))
         .into());
     }
-    if input.reading.holdout.is_none() && !dataset.test.is_empty() {
-        let names: Vec<String> = dataset
-            .test
-            .iter()
-            .map(|view| file_name(&dataset.views[*view].name))
-            .filter(|name| !left_out.contains(name.as_str()))
-            .collect();
-        if !names.is_empty() {
-            let list = input.data.join("test.txt");
-            std::fs::write(&list, names.join("\n") + "\n")
-                .with_context(|| format!("cannot write {}", list.display()))?;
-        }
+    let names: Vec<String> = dataset
+        .test
+        .iter()
+        .map(|view| file_name(&dataset.views[*view].name))
+        .filter(|name| !left_out.contains(name.as_str()))
+        .collect();
+    let list = input.data.join("test.txt");
+    if !names.is_empty() {
+        std::fs::write(&list, names.join("\n") + "\n").with_context(|| format!("cannot write {}", list.display()))?;
+        // The list is the split of the posed dataset. By another one, other views would be held out.
+        input.reading.holdout = None;
+    } else if list.exists() {
+        // Of an earlier run.
+        std::fs::remove_file(&list).with_context(|| format!("cannot remove {}", list.display()))?;
     }
     Ok(())
 }

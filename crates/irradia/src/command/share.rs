@@ -6,7 +6,7 @@ use crate::Usage;
 use crate::terminal::say;
 use anyhow::Result;
 use irradia_runs::formats::SplatFormat;
-use irradia_runs::{Film, Scene, check_kept};
+use irradia_runs::{Film, Scene, check_kept, residual_left_out, scene_of};
 use irradia_viewer::{ShareOptions, share};
 use std::path::{Path, PathBuf};
 
@@ -100,6 +100,10 @@ pub fn run(args: &Args) -> Result<()> {
     }
     let scene = Scene::read(&args.scene)?;
     warn(&scene.notes);
+    warn(&Vec::from_iter(residual_left_out(
+        &scene_of(&args.scene),
+        "a page cannot hold it",
+    )));
     let name = || {
         args.scene
             .file_stem()

@@ -258,10 +258,10 @@ fn a_path_that_cannot_be_written_is_named() {
     let folder = with_run();
     // No user can create a folder below a file.
     irradia(folder.path(), "train data --out run/scene.ply/x --steps 2").refused(1, &["run/scene.ply/x", "--out"]);
-    irradia(folder.path(), "convert run/scene.ply nowhere/out.ply").refused(1, &["nowhere/out.ply"]);
+    irradia(folder.path(), "convert run/scene.ply run/report.json/a.ply").refused(1, &["run/report.json/a.ply"]);
     irradia(folder.path(), "render run --orbit 1 --out run/scene.ply").refused(1, &["run/scene.ply"]);
     irradia(folder.path(), "synth run/scene.ply/x --views 3 --size 8x8").refused(1, &["run/scene.ply/x"]);
-    irradia(folder.path(), "eval run --data data --json nowhere/figures.json").refused(1, &["nowhere/figures.json"]);
+    irradia(folder.path(), "eval run --data data --json run/scene.ply/a.json").refused(1, &["run/scene.ply/a.json"]);
     irradia(folder.path(), "train data --out x --lpips nowhere.safetensors").refused(1, &["nowhere.safetensors"]);
     assert!(!folder.path().join("x").exists());
 }

@@ -9,9 +9,10 @@ mod between;
 mod tries;
 
 use crate::levels::write_scene;
-use crate::{Reading, RunError, Scene, check_kept, read_vignette, scene_of};
+use crate::{Reading, RunError, RunFolder, Scene, check_kept, read_vignette, residual_left_out, scene_of};
 use between::with_views_between;
 use irradia_formats::{SplatFormat, WriteOptions, splat_file_size};
+use irradia_train::model::Model;
 use std::path::PathBuf;
 use tries::{Measure, Tries};
 
@@ -140,13 +141,26 @@ pub fn compact(input: &CompactInput, see: &mut dyn FnMut(CompactEvent)) -> Resul
     let format = input.check()?;
     let file = scene_of(&input.scene);
     check_kept(&file, &input.out)?;
-    let scene = Scene::read(&file)?;
+    let mut scene = Scene::read(&file)?;
+    if let Model::Splats { residual, .. } = &mut scene.model {
+        // The output cannot hold it: what is lost is measured without it.
+        *residual = None;
+    }
     let Some(splats) = scene.model.splats().cloned() else {
         let message = format!("{} is a radiance field: only splats can be compacted", file.display());
         return Err(RunError::Refused(message));
     };
-    let dataset = scene.place(input.reading.read(&input.data)?);
+    let mut reading = input.reading.clone();
+    if let Some(record) = RunFolder::around(&file) {
+        reading = reading.over(record.input.reading);
+    }
+    let mut dataset = reading.read(&input.data)?;
+    if let (None, Some(folder)) = (&input.reading.holdout, RunFolder::containing(&file)) {
+        folder.hold_out_again(&mut dataset)?;
+    }
+    let dataset = scene.place(dataset);
     let mut notes = dataset.warnings.clone();
+    notes.extend(residual_left_out(&file, "splat formats cannot hold it"));
     let measure = Measure::new(&dataset, scene.options, read_vignette(&file)?);
     let before = measure.of(&scene.model)?;
     let held_out_before = measure.of_held_out(&scene.model)?;

@@ -3,6 +3,7 @@
 use super::brought::bring_panorama;
 use super::{MIN_PHOTOS, PoseProgress, film, is_film};
 use crate::RunError;
+use crate::scene_file::same_file;
 use glam::{DQuat, DVec3};
 use irradia_formats::{
     DatasetFormat, FormatError, PanoramaFace, PhotoEntry, PhotoFolder, find_panoramas, photo_files, read_photo_folder,
@@ -38,8 +39,8 @@ struct Sources {
 }
 
 impl Sources {
-    /// Adds `path`, which is a film or a folder of photographs and films, or otherwise the subfolders of `path`.
-    fn add(&mut self, path: &Path, depth: usize) -> Result<(), RunError> {
+    /// Adds `path`, which is a film or a folder of photographs and films, or otherwise the subfolders of `path` except `out`.
+    fn add(&mut self, path: &Path, out: Option<&Path>, depth: usize) -> Result<(), RunError> {
         if is_film(path) {
             self.films.push(path.to_owned());
             return Ok(());
@@ -68,7 +69,8 @@ impl Sources {
             let name = entry.file_name().unwrap_or_default().to_string_lossy();
             ["masks", "depths", "depth", "normals", "normal"].contains(&&*name) || name.starts_with("masks_")
         };
-        entries.retain(|entry| entry.is_dir() && !is_beside(entry));
+        let is_out = |entry: &Path| out.is_some_and(|out| same_file(entry, out));
+        entries.retain(|entry| entry.is_dir() && !is_beside(entry) && !is_out(entry));
         if !photos.is_empty() {
             self.folders.push(path.to_owned());
             // Subfolders may contain smaller copies, or rejected photographs; datasets have subfolders of their own.
@@ -81,7 +83,7 @@ impl Sources {
             // A folder of datasets is not a capture.
             if !entries.iter().any(|entry| DatasetFormat::recognise(entry).is_some()) {
                 for folder in &entries {
-                    self.add(folder, depth - 1)?;
+                    self.add(folder, out, depth - 1)?;
                 }
             }
         }
@@ -92,7 +94,7 @@ impl Sources {
 /// Whether there is anything to pose at `path`: `path` is a film, or contains photographs or films, up to two levels of subfolders deep.
 pub fn is_capture(path: &Path) -> bool {
     let mut sources = Sources::default();
-    sources.add(path, DEPTH).is_ok() && sources != Sources::default()
+    sources.add(path, None, DEPTH).is_ok() && sources != Sources::default()
 }
 
 /// Creates a folder with an empty record, or empties it if its record shows that an earlier call wrote it.
@@ -128,18 +130,20 @@ pub(super) struct Capture {
 }
 
 impl Capture {
-    /// Reads the photographs, films and panoramas in `paths`. Frames and faces are written into subfolders of `out`.
+    /// Reads the photographs, films and panoramas in `paths`. Frames and faces are written into subfolders of `out`, to whose dataset the
+    /// photographs are to be added if `into`.
     ///
     /// # Errors
-    /// When a path or a film cannot be read, or frames or faces cannot be written, for instance without `out`.
+    /// When a path or a film cannot be read, frames or faces cannot be written, for instance without `out`, or panoramas are to be added.
     pub fn read(
         paths: &[PathBuf],
         out: Option<&Path>,
+        into: bool,
         progress: &(dyn Fn(PoseProgress) + Sync),
     ) -> Result<Self, RunError> {
         let mut sources = Sources::default();
         for path in paths {
-            sources.add(path, DEPTH)?;
+            sources.add(path, out, DEPTH)?;
         }
         let mut repeated: Vec<(String, String)> = Vec::new();
         let mut unused = |paths: Vec<PathBuf>, why: &str| {
@@ -180,6 +184,13 @@ impl Capture {
         let panoramas = capture.take_panoramas();
         if !panoramas.is_empty() {
             let out = out.ok_or_else(|| needs_out("faces of panoramas"))?;
+            if into {
+                return Err(RunError::setting(
+                    "into",
+                    out.display(),
+                    "panoramas cannot be added to a dataset: pose all photographs again, with --out",
+                ));
+            }
             capture.add_faces(&panoramas, out)?;
         }
         Ok(capture)
@@ -305,7 +316,7 @@ mod tests {
         };
         let live = |expected: &[&str]| {
             let mut sources = Sources::default();
-            sources.add(root.path(), DEPTH).unwrap();
+            sources.add(root.path(), None, DEPTH).unwrap();
             let [live, beside] = [sources.live, sources.beside];
             assert_eq!(
                 live,
@@ -335,7 +346,7 @@ mod tests {
         fs::write(root.path().join("days/walk.mp4"), "a film by its name").unwrap();
         let mut sources = Sources::default();
         let days = root.path().join("days");
-        sources.add(&days, DEPTH).unwrap();
+        sources.add(&days, None, DEPTH).unwrap();
         assert_eq!(
             sources.folders,
             ["monday", "tuesday/morning"].map(|name| days.join(name))
@@ -347,6 +358,32 @@ mod tests {
         photo("sets/posed/images/1.png");
         fs::write(root.path().join("sets/posed/transforms.json"), "{}").unwrap();
         photo("sets/other/1.png");
-        assert!(!is_capture(&root.path().join("sets")));
+        let sets = root.path().join("sets");
+        assert!(!is_capture(&sets));
+        // Unless it is the output of an earlier call.
+        let mut sources = Sources::default();
+        sources.add(&sets, Some(&sets.join("posed")), DEPTH).unwrap();
+        assert_eq!(sources.folders, [sets.join("other")]);
+    }
+
+    #[test]
+    fn panoramas_to_add_are_refused_before_the_faces_of_others_are_removed() {
+        let root = tempfile::tempdir().unwrap();
+        let (photos, out) = (root.path().join("photos"), root.path().join("data"));
+        fs::create_dir_all(&photos).unwrap();
+        let panorama = photos.join("1.png");
+        write_png(&panorama, 512, 256, 1, &[7; 512 * 256]).unwrap();
+        let mut bytes = fs::read(&panorama).unwrap();
+        // Where metadata are searched for the projection.
+        bytes.extend(b"equirectangular");
+        fs::write(&panorama, bytes).unwrap();
+        begin(&out.join(FACES), FACES_RECORD).unwrap();
+        let face = out.join(FACES).join("0_front.jpg");
+        fs::write(&face, "written by an earlier call").unwrap();
+        let error = Capture::read(&[photos], Some(&out), true, &|_| ())
+            .unwrap_err()
+            .to_string();
+        assert!(error.contains("panoramas cannot be added"), "{error}");
+        assert!(face.exists());
     }
 }

@@ -299,7 +299,7 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     };
     fs::create_dir_all(out).map_err(RunError::io("create", out))?;
     let mut clock = Clock::new();
-    let mut capture = Capture::read(&input.photos, Some(out), progress)?;
+    let mut capture = Capture::read(&input.photos, Some(out), input.into, progress)?;
     still::ignore_own(&mut capture.folder.photos, out)?;
     if let Some(only) = &input.only {
         let is_one = |photo: &PhotoEntry| only.contains(&photo.name);
@@ -308,13 +308,6 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
         }
     }
     if let Some(known) = &known {
-        if capture.has_panoramas() {
-            return Err(RunError::setting(
-                "into",
-                out.display(),
-                "panoramas cannot be added to a dataset: pose all photographs again, with --out",
-            ));
-        }
         capture.folder = known.with(capture.folder)?;
     }
     let mut folder = &capture.folder;

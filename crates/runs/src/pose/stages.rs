@@ -10,14 +10,15 @@ use irradia_sfm::features::{Extractor, GreyPhoto, Sift};
 use irradia_sfm::matching::{MatchOptions, PairOptions, candidate_pairs, match_pairs};
 use irradia_sfm::{Features, PairMatches};
 use rayon::prelude::*;
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-/// Number of pairs that are matched between two checks of the time.
+/// Number of photographs per thread whose features are extracted, and of pairs that are matched, between two checks of the time.
+const PHOTOS_PER_THREAD: usize = 32;
 const BATCH: usize = 1000;
-/// How often matches are saved while pairs are matched.
+/// How often features and matches are saved while they are found.
 const SAVED_EVERY: Duration = Duration::from_secs(60);
 
 /// Files of features and matches: of the first attempt, of a second one, and of photographs in which what stands still is masked.
@@ -188,24 +189,43 @@ impl<'a> Work<'a> {
             name: "features",
             of: photos.len(),
         });
-        let done = AtomicUsize::new(0);
-        let found: Vec<Result<Option<Looks>, String>> = photos
-            .par_iter()
-            .map(|photo| {
-                let looks = match self.known.looks.contains_key(&photo.hash) {
-                    true => Ok(None),
-                    false => extract(&self.sift, photo).map(Some),
-                };
-                let now = done.fetch_add(1, Ordering::Relaxed) + 1;
-                (self.progress)(PoseProgress::Done(now));
-                looks
-            })
+        let new: Vec<&PhotoEntry> = photos
+            .iter()
+            .filter(|photo| !self.known.looks.contains_key(&photo.hash))
             .collect();
-        let mut is_new = false;
-        for (i, (photo, looks)) in photos.iter().zip(found).enumerate() {
-            is_new |= matches!(looks, Ok(Some(_)));
-            match looks.map(|new| new.or_else(|| self.known.looks.remove(&photo.hash))) {
-                Ok(looks) => {
+        let done = AtomicUsize::new(photos.len() - new.len());
+        let mut failed: HashMap<u64, String> = HashMap::new();
+        let mut saved = Instant::now();
+        for some in new.chunks(PHOTOS_PER_THREAD * rayon::current_num_threads()) {
+            let found: Vec<Result<Looks, String>> = some
+                .par_iter()
+                .map(|photo| {
+                    let looks = extract(&self.sift, photo);
+                    let now = done.fetch_add(1, Ordering::Relaxed) + 1;
+                    (self.progress)(PoseProgress::Done(now));
+                    looks
+                })
+                .collect();
+            for (photo, looks) in some.iter().zip(found) {
+                match looks {
+                    Ok(looks) => self.known.looks.extend([(photo.hash, looks)]),
+                    Err(reason) => failed.extend([(photo.hash, reason)]),
+                }
+            }
+            if saved.elapsed() > SAVED_EVERY {
+                self.save()?;
+                saved = Instant::now();
+            }
+        }
+        for (i, photo) in photos.iter().enumerate() {
+            match failed.get(&photo.hash) {
+                None => {
+                    // A photograph may be there twice.
+                    let comes_again = photos[i + 1..].iter().any(|other| other.hash == photo.hash);
+                    let looks = match comes_again {
+                        true => self.known.looks.get(&photo.hash).cloned(),
+                        false => self.known.looks.remove(&photo.hash),
+                    };
                     let Looks {
                         features,
                         colors,
@@ -217,7 +237,7 @@ impl<'a> Work<'a> {
                     self.colors.push(colors);
                     self.appearances.push(appearance);
                 }
-                Err(reason) => self.undecodable.push((photo.name.clone(), reason)),
+                Some(reason) => self.undecodable.push((photo.name.clone(), reason.clone())),
             }
         }
         // Discards photographs that no longer exist.
@@ -226,7 +246,7 @@ impl<'a> Work<'a> {
         self.known
             .matches
             .retain(|pair, _| pair.iter().all(|hash| kept.contains(hash)));
-        if is_new {
+        if failed.len() < new.len() {
             self.save()?;
         }
         Ok(())
@@ -234,13 +254,19 @@ impl<'a> Work<'a> {
 
     fn save(&self) -> Result<(), RunError> {
         let Some(path) = &self.path else { return Ok(()) };
-        let photos = (
-            &self.hashes[..],
-            &self.features[..],
-            &self.colors[..],
-            &self.appearances[..],
-        );
-        Ok(store::write(path, self.settings, photos, &self.known.matches)?)
+        let ordered = self.hashes.iter().zip(&self.features).zip(&self.colors);
+        let mut photos: Vec<store::Photo> = ordered
+            .zip(&self.appearances)
+            .map(|(((hash, features), colors), appearance)| (*hash, features, &colors[..], *appearance))
+            .collect();
+        // While features are extracted, all that are known are still here.
+        let mut known: Vec<_> = self.known.looks.iter().collect();
+        known.sort_unstable_by_key(|(hash, _)| **hash);
+        let known = known
+            .into_iter()
+            .map(|(hash, looks)| (*hash, &looks.features, &looks.colors[..], looks.appearance));
+        photos.extend(known);
+        Ok(store::write(path, self.settings, &photos, &self.known.matches)?)
     }
 
     /// Matches the pairs that are worth matching.
@@ -361,4 +387,21 @@ pub(super) fn color_at(data: &[u8], [width, height]: [u32; 2], channels: u32, x:
     let pixel = at(y, height) * width as usize + at(x, width);
     let from = pixel * channels as usize;
     [0, 1, 2].map(|c| data[from + c])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn features_saved_while_others_are_extracted_are_reused() {
+        let out = tempfile::tempdir().unwrap();
+        let folder = PhotoFolder::default();
+        let progress = |_: PoseProgress| ();
+        let mut work = Work::new(None, Some(out.path()), &folder, &progress);
+        work.known.looks.extend([7, 3].map(|hash| (hash, Looks::default())));
+        work.save().unwrap();
+        let again = Work::new(None, Some(out.path()), &folder, &progress);
+        assert_eq!(again.known, work.known);
+    }
 }

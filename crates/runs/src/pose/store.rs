@@ -69,26 +69,26 @@ pub(super) fn read(path: &Path, settings: Settings) -> (Known, Option<String>) {
     }
 }
 
-/// Hashes of photographs, their features, the colours of these, and their pixel statistics.
-pub(super) type Photos<'a> = (&'a [u64], &'a [Features], &'a [Vec<[u8; 3]>], &'a [Appearance]);
+/// The hash of a photograph, its features, their colours, and its pixel statistics.
+pub(super) type Photo<'a> = (u64, &'a Features, &'a [[u8; 3]], Appearance);
 
 /// Writes photographs and the matches between them.
 pub(super) fn write(
     path: &Path,
     settings: Settings,
-    (hashes, features, colors, appearances): Photos,
+    photos: &[Photo],
     matches: &HashMap<[u64; 2], Vec<[u32; 2]>>,
 ) -> Result<(), FormatError> {
     write_atomic(path, |out| {
         out.write_all(&settings.header())?;
-        write_u64(out, hashes.len() as u64)?;
-        for (((hash, features), colors), appearance) in hashes.iter().zip(features).zip(colors).zip(appearances) {
+        write_u64(out, photos.len() as u64)?;
+        for (hash, features, colors, appearance) in photos {
             write_u64(out, *hash)?;
             for value in appearance.to_array() {
                 out.write_all(&value.to_le_bytes())?;
             }
             write_u64(out, colors.len() as u64)?;
-            for (i, (k, color)) in features.keypoints.iter().zip(colors).enumerate() {
+            for (i, (k, color)) in features.keypoints.iter().zip(*colors).enumerate() {
                 for value in [k.x, k.y, k.scale, k.angle] {
                     out.write_all(&value.to_le_bytes())?;
                 }
@@ -210,12 +210,10 @@ mod tests {
     }
 
     fn save(path: &Path, settings: Settings, known: &Known) {
-        let hashes: Vec<u64> = known.looks.keys().copied().collect();
-        let features: Vec<Features> = known.looks.values().map(|looks| looks.features.clone()).collect();
-        let colors: Vec<Vec<[u8; 3]>> = known.looks.values().map(|looks| looks.colors.clone()).collect();
-        let appearances: Vec<Appearance> = known.looks.values().map(|looks| looks.appearance).collect();
-        let photos = (&hashes[..], &features[..], &colors[..], &appearances[..]);
-        write(path, settings, photos, &known.matches).unwrap();
+        let photos: Vec<Photo> = (known.looks.iter())
+            .map(|(hash, looks)| (*hash, &looks.features, &looks.colors[..], looks.appearance))
+            .collect();
+        write(path, settings, &photos, &known.matches).unwrap();
     }
 
     #[test]

@@ -142,7 +142,7 @@ fn what_turns_is_posed_and_what_stands_still_behind_it_is_masked() {
         (RING, report.warnings.len())
     );
     assert_eq!(fs::read_dir(&masks).unwrap().count(), RING + 1);
-    assert_eq!(fs::read(out.join("unused/masks/00.png.png")).unwrap(), kept);
+    assert_eq!(fs::read(out.join("unused/masks/00.png.2.png")).unwrap(), kept);
     // Photographs with masks of their own keep them.
     let own = folder.path().join("own");
     fs::create_dir(&own).unwrap();

@@ -8,6 +8,7 @@ import "./timeline.js";
 import "./help.js";
 import "./commands.js";
 import "./edit/placement.js";
+import { stage } from "./commands.js";
 import { connection } from "./connection.js";
 import { homeOf } from "./navigation.js";
 import { sharedValues } from "./share.js";
@@ -23,6 +24,9 @@ state.watch(["hello"], () => {
   const hello = state.get("hello");
   if (hello) document.title = `${hello.title} · Irradia`;
 });
+
+// A restarted server numbers its scenes from the start: the same number may mean other splats. The event of its scene comes after this one.
+state.addEventListener("hello", () => stage().local?.forget());
 
 // The first scene determines the first camera; later versions keep it.
 let placed = false;

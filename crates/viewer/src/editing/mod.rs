@@ -9,6 +9,7 @@ mod world;
 
 use crate::message::EditRequest;
 use irradia_edit::{Draft, EditError, EditList};
+use irradia_runs::RunError;
 use irradia_runs::formats::{FormatError, read_splats};
 use irradia_scene::GaussianCloud;
 use serde_json::Value;
@@ -33,6 +34,8 @@ pub(crate) enum EditingError {
     Edit(#[from] EditError),
     #[error(transparent)]
     Format(#[from] FormatError),
+    #[error(transparent)]
+    Run(#[from] RunError),
 }
 
 #[derive(Default)]

@@ -2,9 +2,10 @@
 
 use super::EditingError;
 use super::session::Session;
-use irradia_runs::formats::{FormatError, write_atomic, write_splats};
-use std::fs;
+use irradia_runs::formats::{FormatError, SplatFormat, write_atomic, write_splats};
+use irradia_runs::write_own_cameras;
 use std::path::{Path, PathBuf};
+use std::{fs, io};
 
 /// Where a session has been saved.
 #[derive(Clone, Debug)]
@@ -46,18 +47,18 @@ pub(super) fn folder_of(source: &Path) -> &Path {
     entry_of(source).parent().unwrap_or(Path::new(""))
 }
 
-/// The name of a scene's file, or of its folder of images, without the extension.
+/// The name of a scene's file without the end that tells its format, or the name of its folder of images.
 pub(crate) fn stem_of(source: &Path) -> String {
     let name = entry_of(source)
         .file_name()
         .map(|name| name.to_string_lossy().into_owned())
         .unwrap_or_default();
-    let stem = name.split('.').next().unwrap_or_default();
-    if stem.is_empty() {
-        "scene".to_owned()
-    } else {
-        stem.to_owned()
-    }
+    let stem = match SplatFormat::of(source) {
+        Ok(SplatFormat::SogFolder) => Some(name.as_str()),
+        Ok(format) => name.get(..name.len() - format.suffix().len()),
+        Err(_) => Path::new(&name).file_stem().and_then(|stem| stem.to_str()),
+    };
+    stem.filter(|stem| !stem.is_empty()).unwrap_or("scene").to_owned()
 }
 
 /// Writes the list, the scene, the scenes that were split off and those that pages sent to be merged; to the same files as before if the
@@ -84,6 +85,7 @@ pub(super) fn save(session: &Session, source: &Path, before: Option<&Saved>) -> 
     };
     let parts = session.parts()?;
     write_splats(&scene, &session.draft().shown())?;
+    write_own_cameras(source, &scene, &session.moved())?;
     let path_of = |name: &str| scene.with_extension(format!("{name}.ply"));
     for (name, part) in &parts {
         write_splats(&path_of(name), part)?;
@@ -109,26 +111,63 @@ pub(super) fn save(session: &Session, source: &Path, before: Option<&Saved>) -> 
     })
 }
 
-/// Writes the list of a session that ends to a new file beside the scene's, if it has unsaved edits; returns the path of the file.
-pub(super) fn save_rest(
-    session: &Session,
-    source: &Path,
-    saved: Option<&Saved>,
-) -> Result<Option<PathBuf>, EditingError> {
-    let list = session.list();
-    let text = list.to_toml();
-    if list.edits.is_empty() || saved.is_some_and(|saved| saved.text == text) {
-        return Ok(None);
+/// The file of a session's unsaved edits beside the scene: it is kept up to date, so that a crash loses nothing.
+#[derive(Default)]
+pub(super) struct Rest {
+    /// The file and the list as it was written; `None` if nothing is unsaved.
+    written: Option<(PathBuf, String)>,
+    /// The scenes that the list merged when they were last written.
+    merged: Vec<String>,
+}
+
+impl Rest {
+    /// The file, if there are unsaved edits.
+    pub fn path(&self) -> Option<&Path> {
+        self.written.as_ref().map(|(path, _)| path.as_path())
     }
+
+    /// Writes the session's list to the file if it differs from what is written and saved; removes the file if nothing is unsaved.
+    ///
+    /// # Errors
+    /// When a file cannot be written or removed.
+    pub fn keep(&mut self, session: &Session, source: &Path, saved: Option<&Saved>) -> Result<(), EditingError> {
+        let list = session.list();
+        let text = list.to_toml();
+        if list.edits.is_empty() || saved.is_some_and(|saved| saved.text == text) {
+            return self.remove();
+        }
+        if self.written.as_ref().is_none_or(|(_, written)| *written != text) {
+            let path = self.path().map_or_else(|| unused(source), Path::to_owned);
+            write_atomic(&path, |out| out.write_all(text.as_bytes()))?;
+            self.written = Some((path, text));
+        }
+        // After the list: a merged scene that cannot be written must not lose it.
+        let merged: Vec<String> = session.merged().map(str::to_owned).collect();
+        if merged != self.merged {
+            session.save_merged()?;
+            self.merged = merged;
+        }
+        Ok(())
+    }
+
+    fn remove(&mut self) -> Result<(), EditingError> {
+        let Some((path, _)) = self.written.take() else {
+            return Ok(());
+        };
+        match fs::remove_file(&path) {
+            Err(source) if source.kind() != io::ErrorKind::NotFound => Err(FormatError::Write { path, source }.into()),
+            _ => Ok(()),
+        }
+    }
+}
+
+/// A new file for unsaved edits of the scene `source`.
+fn unused(source: &Path) -> PathBuf {
     let (folder, stem) = (folder_of(source), stem_of(source));
-    let name = |number: usize| folder.join(format!("{stem}.unsaved-{number}.toml"));
-    let path = (1..)
-        .map(name)
+    (1..)
+        .map(|number: usize| folder.join(format!("{stem}.unsaved-{number}.toml")))
         .find(|path| !path.exists())
-        .expect("some number is free");
-    session.save_merged()?;
-    write_atomic(&path, |out| out.write_all(text.as_bytes()))?;
-    Ok(Some(path))
+        .expect("some number is free")
 }
 
 #[cfg(test)]
@@ -140,7 +179,24 @@ mod tests {
     use std::sync::Arc;
 
     #[test]
-    fn edits_that_were_not_saved_are_kept_once() {
+    fn a_scene_is_named_without_its_format() {
+        for (source, stem) in [
+            ("a/scene.ply", "scene"),
+            ("a/scene.edited.ply", "scene.edited"),
+            ("garden.v1.compressed.ply", "garden.v1"),
+            ("Garden.SPZ", "Garden"),
+            ("garden.spz.glb", "garden"),
+            ("a/garden.v1/meta.json", "garden.v1"),
+            ("garden.v1.unknown", "garden.v1"),
+            ("a/.ply", "scene"),
+            ("meta.json", "scene"),
+        ] {
+            assert_eq!(stem_of(source.as_ref()), stem, "{source}");
+        }
+    }
+
+    #[test]
+    fn edits_that_are_not_saved_are_in_one_file() {
         let folder = tempfile::tempdir().unwrap();
         let source = folder.path().join("a.ply");
         let cloud = GaussianCloud {
@@ -151,14 +207,25 @@ mod tests {
             sh: vec![0.3; 3],
             ..GaussianCloud::default()
         };
+        let file = folder.path().join("a.unsaved-1.toml");
         let mut session = Session::new(Draft::new(cloud, Vec::new()), Arc::new(Uploads::new(folder.path())));
-        assert_eq!(save_rest(&session, &source, None).unwrap(), None, "nothing was done");
-        session.edit(1, true, Operation::Opacity { factor: 0.5 }).unwrap();
+        let mut rest = Rest::default();
+        let mut keep = |session: &Session, saved: Option<&Saved>| {
+            rest.keep(session, &source, saved).unwrap();
+            assert_eq!(rest.path(), file.exists().then_some(file.as_path()));
+            fs::read_to_string(&file).ok()
+        };
+        assert_eq!(keep(&session, None), None, "nothing was done");
+        for (gesture, factor) in [(1, 0.5), (2, 0.25)] {
+            let op = Operation::Opacity { factor };
+            session.edit(gesture, true, op).unwrap();
+            assert_eq!(keep(&session, None), Some(session.list().to_toml()));
+        }
         let saved = save(&session, &source, None).unwrap();
-        assert_eq!(save_rest(&session, &source, Some(&saved)).unwrap(), None);
-        session.edit(2, true, Operation::Opacity { factor: 0.25 }).unwrap();
-        let rest = save_rest(&session, &source, Some(&saved)).unwrap().expect("a file");
-        assert_eq!(rest, folder.path().join("a.unsaved-1.toml"));
-        assert_eq!(std::fs::read_to_string(rest).unwrap(), session.list().to_toml());
+        assert_eq!(keep(&session, Some(&saved)), None, "saved");
+        session.go(1).unwrap();
+        assert_eq!(keep(&session, Some(&saved)), Some(session.list().to_toml()));
+        session.go(0).unwrap();
+        assert_eq!(keep(&session, Some(&saved)), None, "all is undone");
     }
 }

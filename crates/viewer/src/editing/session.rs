@@ -4,8 +4,8 @@ use super::EditingError;
 use super::uploads::Uploads;
 use super::world::{operation_to_dataset, placement, step_to_dataset};
 use irradia_edit::{
-    Draft, Edit, EditError, EditList, Mode, Operation, SelectStep, Selection, Shape, Transform, apply, floater_scores,
-    select,
+    Draft, Edit, EditError, EditList, Mode, Operation, SelectStep, Selection, Shape, Transform, apply, apply_to,
+    floater_scores, select,
 };
 use irradia_scene::{GaussianCloud, Similarity};
 use std::sync::Arc;
@@ -53,6 +53,8 @@ pub(crate) struct Session {
     /// The steps of the current selection.
     steps: Vec<SelectStep>,
     selected: Arc<Selection>,
+    /// The state, the steps and the selection before the last edit: a slider makes it again and again.
+    before: Option<(Arc<Draft>, Vec<SelectStep>, Arc<Selection>)>,
     /// The floater score of each splat of a state.
     scores: Option<(Arc<Draft>, Vec<f32>)>,
     /// Scenes to merge.
@@ -79,6 +81,7 @@ impl Session {
             }],
             draft,
             steps: Vec::new(),
+            before: None,
             scores: None,
             uploads,
         }
@@ -131,14 +134,18 @@ impl Session {
         }
     }
 
-    /// From the world of the scene as it was opened to the current one.
-    pub fn placement(&self) -> Transform {
+    /// How the edits moved the whole scene, in the dataset's coordinates.
+    pub fn moved(&self) -> Transform {
         let moved = self.entries[..self.at].iter().filter_map(|entry| match &entry.deed {
             Deed::Edit(_, moved) => moved.as_ref(),
             _ => None,
         });
-        let moved = moved.fold(Transform::IDENTITY, |all, next| all.then(next));
-        placement(&self.original().cloud.world_from_dataset, &moved, self.world())
+        moved.fold(Transform::IDENTITY, |all, next| all.then(next))
+    }
+
+    /// From the world of the scene as it was opened to the current one.
+    pub fn placement(&self) -> Transform {
+        placement(&self.original().cloud.world_from_dataset, &self.moved(), self.world())
     }
 
     fn world(&self) -> &Similarity {
@@ -241,16 +248,23 @@ impl Session {
     /// Makes the edits of a list, in the dataset's coordinates; each is an entry.
     ///
     /// # Errors
-    /// When one is not possible; those before it have been made.
+    /// When one is not possible; those before it have been made, but none if a scene to merge is missing.
     pub fn replay(&mut self, list: &EditList) -> Result<(), EditError> {
+        let in_list = |i: usize, reason: EditError| EditError::InList {
+            number: i + 1,
+            reason: Box::new(reason),
+        };
+        for (i, edit) in list.edits.iter().enumerate() {
+            if let Operation::Merge { file } = &edit.op {
+                let opened = self.uploads.open(file).map_err(EditError::Source);
+                opened.map_err(|reason| in_list(i, reason))?;
+            }
+        }
         for (i, edit) in list.edits.iter().enumerate() {
             let made = self
                 .has_room(edit.select.as_deref().unwrap_or_default())
                 .and_then(|()| self.make(0, edit.clone()));
-            made.map_err(|reason| EditError::InList {
-                number: i + 1,
-                reason: Box::new(reason),
-            })?;
+            made.map_err(|reason| in_list(i, reason))?;
         }
         Ok(())
     }
@@ -262,7 +276,13 @@ impl Session {
             *name = format!("part-{}", parts.count() + 1);
         }
         let mut draft = (*self.draft).clone();
-        let applied = apply(&mut draft, &edit, &|file| self.uploads.open(file))?;
+        let open = |file: &str| self.uploads.open(file);
+        // What is selected need not be searched for again, which may take a minute.
+        let applied = match edit.select.as_ref() == Some(&self.steps) {
+            true => apply_to(&mut draft, &edit, &self.selected, &open)?,
+            false => apply(&mut draft, &edit, &open)?,
+        };
+        self.before = Some((self.draft.clone(), self.steps.clone(), self.selected.clone()));
         let text = edit_text(&applied.edit.op, applied.selected, self.draft.len(), draft.len());
         self.push(gesture, text, Deed::Edit(applied.edit, applied.moved));
         self.set_draft(Arc::new(draft));
@@ -357,11 +377,11 @@ impl Session {
     /// Undoes or redoes entries until the first `at` are made.
     ///
     /// # Errors
-    /// Those of the edits, although these have been made before.
+    /// Those of the edits, although these have been made before: a merged file may be gone. Nothing has changed then.
     pub fn go(&mut self, at: usize) -> Result<(), EditError> {
         let at = at.min(self.entries.len());
         let before = self.edits().count();
-        self.at = at;
+        let was = std::mem::replace(&mut self.at, at);
         let edits = self.edits().count();
         if edits != before {
             let nearest = self.kept.iter().rfind(|kept| kept.edits <= edits);
@@ -369,16 +389,33 @@ impl Session {
                 nearest.map_or((0, self.original().clone()), |kept| (kept.edits, kept.draft.clone()));
             let again: Vec<Edit> = self.edits().skip(made).cloned().collect();
             for edit in again {
-                apply(Arc::make_mut(&mut draft), &edit, &|file| self.uploads.open(file))?;
+                if let Err(error) = apply(Arc::make_mut(&mut draft), &edit, &|file| self.uploads.open(file)) {
+                    self.at = was;
+                    return Err(error);
+                }
                 made += 1;
             }
             debug_assert_eq!(made, edits);
             self.set_draft(draft);
         }
         let steps = self.steps_at(at);
-        self.selected = Arc::new(self.evaluate(&steps, 0)?);
+        let known = self.before.as_ref();
+        let known = known.filter(|(draft, of, _)| Arc::ptr_eq(draft, &self.draft) && *of == steps);
+        let known = known.map(|(_, _, selected)| selected.clone());
+        self.selected = match known {
+            Some(selected) => selected,
+            None => Arc::new(self.evaluate(&steps, 0)?),
+        };
         self.steps = steps;
         Ok(())
+    }
+
+    /// The scenes that the list merges.
+    pub fn merged(&self) -> impl Iterator<Item = &str> {
+        self.edits().filter_map(|edit| match &edit.op {
+            Operation::Merge { file } => Some(file.as_str()),
+            _ => None,
+        })
     }
 
     /// Writes the scenes that the list merges beside the scene.
@@ -386,11 +423,7 @@ impl Session {
     /// # Errors
     /// When one cannot be written.
     pub fn save_merged(&self) -> Result<(), EditingError> {
-        let merged = self.edits().filter_map(|edit| match &edit.op {
-            Operation::Merge { file } => Some(file),
-            _ => None,
-        });
-        merged.into_iter().try_for_each(|file| self.uploads.save(file))
+        self.merged().try_for_each(|file| self.uploads.save(file))
     }
 
     /// The scenes that were split off, with their names.
@@ -650,6 +683,31 @@ mod tests {
         broken.edits.push("upright".parse().expect("an edit"));
         let error = opened.replay(&broken).expect_err("no cameras").to_string();
         assert!(error.contains('3') && opened.at() == 2, "{error}");
+        // A missing scene is found before the first edit is made.
+        let file = "absent.ply".to_owned();
+        *broken.edits.last_mut().expect("three") = Edit::of_scene(Operation::Merge { file });
+        let error = opened.replay(&broken).expect_err("no such scene").to_string();
+        assert!(error.starts_with("edit 3: merge: ") && opened.at() == 2, "{error}");
+    }
+
+    #[test]
+    fn a_slider_edits_the_same_selection_at_every_tick() {
+        let mut session = session(6);
+        session.select(1, true, ball(1.0, 1.2)).expect("a ball");
+        let known = session.selected().clone();
+        for factor in [0.9, 0.5, 0.2] {
+            session.edit(2, false, Operation::Opacity { factor }).expect("faded");
+            assert_eq!((session.at(), replayed(&session)), (2, (**session.draft()).clone()));
+        }
+        session.go(1).expect("undone");
+        assert!(Arc::ptr_eq(session.selected(), &known), "it is not evaluated again");
+        // The same steps select something else in another state.
+        session.edit(3, false, Operation::Delete {}).expect("deleted");
+        session.select(4, true, ball(1.0, 1.2)).expect("a ball");
+        session.go(2).expect("undone");
+        session.go(3).expect("made before");
+        assert_eq!((session.selected().len(), selected(&session)), (3, vec![]));
+        assert_eq!(replayed(&session), **session.draft());
     }
 
     #[test]

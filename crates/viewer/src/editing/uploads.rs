@@ -1,8 +1,8 @@
-//! Scenes that pages have sent to be merged. Edits can name these, and no other files.
+//! Scenes that pages have sent to be merged. Edits can name these and scenes beside the edited one, and no other files.
 
 use super::EditingError;
 use irradia_edit::EditError;
-use irradia_runs::formats::{FormatError, SplatFormat, parse_splats, write_atomic};
+use irradia_runs::formats::{FormatError, SplatFormat, parse_splats, read_splats, write_atomic};
 use irradia_scene::GaussianCloud;
 use std::collections::BTreeMap;
 use std::fs;
@@ -19,7 +19,7 @@ struct Upload {
 
 /// The scenes that were sent, by name.
 pub(crate) struct Uploads {
-    /// Where saving writes them.
+    /// The folder of the edited scene, where saving writes them.
     folder: PathBuf,
     files: Mutex<BTreeMap<String, Upload>>,
 }
@@ -82,16 +82,21 @@ impl Uploads {
         }
     }
 
-    /// The scene that edits call `name`.
+    /// The scene that edits call `name`: one that was sent, otherwise a file beside the edited scene, as lists that were saved name it.
     ///
     /// # Errors
-    /// When no page has sent it.
+    /// When there is none, or the file cannot be read.
     pub fn open(&self, name: &str) -> Result<GaussianCloud, String> {
         let files = self.files.lock().unwrap_or_else(PoisonError::into_inner);
-        let upload = files.get(name);
-        upload
-            .map(|upload| upload.cloud.clone())
-            .ok_or_else(|| format!("no scene {name} has been sent: choose it with Merge first"))
+        if let Some(upload) = files.get(name) {
+            return Ok(upload.cloud.clone());
+        }
+        drop(files);
+        let path = self.folder.join(name);
+        if name.contains(['/', '\\', ':']) || !path.is_file() {
+            return Err(format!("no scene {name} has been sent: choose it with Merge first"));
+        }
+        read_splats(&path).map_err(|error| error.to_string())
     }
 
     /// Writes the file `name` to the folder, where `irradia edit` finds it.
@@ -155,7 +160,12 @@ mod tests {
         assert_eq!(add("room.ply", 2.0), "room-2.ply");
         assert_eq!(add("taken.ply", 1.0), "taken-2.ply");
         assert_eq!(uploads.open("room-2.ply").unwrap().opacity_logits, [2.0]);
-        assert!(uploads.open("/etc/passwd").unwrap_err().contains("has been sent"));
+        fs::write(folder.path().join("beside.ply"), scene(3.0)).unwrap();
+        assert_eq!(uploads.open("beside.ply").unwrap().opacity_logits, [3.0]);
+        let within = format!("../{}/beside.ply", folder.path().file_name().unwrap().display());
+        for name in ["/etc/passwd", "..", "", "absent.ply", within.as_str()] {
+            assert!(uploads.open(name).unwrap_err().contains("has been sent"), "{name}");
+        }
         uploads.save("room.ply").unwrap();
         uploads.save("room.ply").unwrap();
         assert_eq!(fs::read(folder.path().join("room.ply")).unwrap(), scene(1.0));

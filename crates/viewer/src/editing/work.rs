@@ -1,6 +1,6 @@
 //! The editing thread.
 
-use super::save::{Saved, save, save_rest};
+use super::save::{Rest, Saved, save};
 use super::session::Session;
 use super::{Editing, EditingError};
 use crate::message::EditRequest;
@@ -10,6 +10,7 @@ use irradia_runs::formats::read_splats;
 use irradia_runs::{Scene, photographs_of};
 use irradia_splat::{RenderOptions, Splats};
 use serde_json::{Value, json};
+use std::path::Path;
 use std::sync::Arc;
 
 /// Maximum number of entries of the list that pages are told: those around the current position.
@@ -22,6 +23,9 @@ struct Bench {
     /// Whether the scene is shown as it was opened.
     before: bool,
     saved: Option<Saved>,
+    rest: Rest,
+    /// Whether the last attempt to keep the unsaved edits has failed, which pages are told once.
+    fails: bool,
     /// What was shown last: splats, selection and its number, which is 0 if nothing is selected.
     shown: Option<(Arc<Draft>, Option<Arc<Selection>>)>,
     mask: u64,
@@ -57,18 +61,26 @@ pub(crate) fn work(editing: &Editing, subject: &Subject, tell: &dyn Fn(u64, &str
         if let Some(bench) = &mut bench {
             bench.show(subject);
             editing.keep(bench.session.draft(), bench.session.list());
+            let failed_before = bench.fails;
+            if let Err(error) = bench.keep_rest(editing)
+                && !failed_before
+            {
+                tell(seat, &format!("unsaved edits would be lost in a crash: {error}"));
+            }
             told = bench.to_json();
         }
         wake();
         editing.tell(told);
     }
-    let Bench { session, saved, .. } = bench.as_ref()?;
-    match save_rest(session, &editing.source, saved.as_ref()) {
-        Ok(path) => Some(format!(
-            "unsaved edits are in {}: use Open edits to make them again",
-            path?.display()
+    let mut bench = bench?;
+    let kept = bench.keep_rest(editing);
+    match (bench.rest.path().map(Path::display), kept) {
+        (None, Ok(())) => None,
+        (Some(path), Ok(())) => Some(format!(
+            "unsaved edits are in {path}: use Open edits to make them again"
         )),
-        Err(error) => Some(format!("unsaved edits are lost: {error}")),
+        (Some(path), Err(error)) => Some(format!("unsaved edits are in {path}, but not all of them: {error}")),
+        (None, Err(error)) => Some(format!("unsaved edits are lost: {error}")),
     }
 }
 
@@ -86,6 +98,8 @@ impl Bench {
             options: scene.map_or_else(RenderOptions::default, |scene| scene.options),
             before: false,
             saved: None,
+            rest: Rest::default(),
+            fails: false,
             // What is drawn was read from the same file.
             shown: (drawn == Some(session.draft().len())).then(|| (session.original().clone(), None)),
             session,
@@ -123,6 +137,13 @@ impl Bench {
             }
         }
         Ok(None)
+    }
+
+    /// Writes the unsaved edits beside the scene.
+    fn keep_rest(&mut self, editing: &Editing) -> Result<(), EditingError> {
+        let kept = self.rest.keep(&self.session, &editing.source, self.saved.as_ref());
+        self.fails = kept.is_err();
+        kept
     }
 
     /// Shows the current state of the session.

@@ -186,6 +186,12 @@ export class LocalRenderer {
     this.scene = scene;
   }
 
+  /** Forgets which version and selection it has, so that the next scene is loaded in any case; shows the old one until then. */
+  forget() {
+    this.abort?.abort();
+    [this.version, this.masked, this.scene] = [0, 0, null];
+  }
+
   /** @param {WebGpu | WebGl} painter @param {import("../state.js").Scene} scene */
   async fetch(painter, scene) {
     if (this.version === scene.version) return;

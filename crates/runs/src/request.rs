@@ -146,9 +146,9 @@ impl Reading {
 
     /// Makes the paths in `holdout` and `images` absolute.
     fn with_absolute_paths(mut self) -> Self {
-        self.images = self.images.map(|folder| std::path::absolute(&folder).unwrap_or(folder));
+        self.images = self.images.map(absolute);
         if let Ok(Holdout::Listed(file)) = self.holdout() {
-            self.holdout = Some(std::path::absolute(&file).unwrap_or(file).display().to_string());
+            self.holdout = Some(absolute(file).display().to_string());
         }
         self
     }
@@ -335,7 +335,6 @@ impl TrainInput {
         self.reading = self.reading.with_absolute_paths();
         let reading = self.reading.check()?;
         let recipe = read_recipe(&self.recipe, &self.overrides())?;
-        let absolute = |path: PathBuf| std::path::absolute(&path).unwrap_or(path);
         self.data = absolute(self.data);
         self.lpips = self.lpips.map(absolute);
         self.unseen_lpips = self.unseen_lpips.map(absolute);
@@ -353,6 +352,10 @@ impl TrainInput {
             started,
         })
     }
+}
+
+fn absolute(path: PathBuf) -> PathBuf {
+    std::path::absolute(&path).unwrap_or(path)
 }
 
 fn at_least_one<N: PartialOrd + From<u8> + Display>(name: &'static str, value: Option<N>) -> Result<(), RunError> {

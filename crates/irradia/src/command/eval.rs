@@ -98,7 +98,9 @@ pub fn run(args: &Args) -> Result<()> {
     let mut dataset = reading.read(&args.data)?;
     if let (None, Some(folder)) = (&args.reading.holdout, RunFolder::containing(&args.scene)) {
         // The run was trained on all others.
+        let known = dataset.warnings.len();
         folder.hold_out_again(&mut dataset)?;
+        warn(&dataset.warnings[known..]);
     }
     let dataset = scene.place(dataset);
     let background = match (args.background, &run) {

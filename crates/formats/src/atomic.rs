@@ -37,12 +37,19 @@ fn write_beside(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Result<()
     temporary.become_file(path)
 }
 
-/// Where links from `path` lead, also if there is no file yet, which has no canonical path.
+/// Where links from `path` lead, also if there is no file yet, which has no canonical path. Links may lead in a circle: as many are followed
+/// as by Linux.
 fn destination(path: &Path) -> PathBuf {
-    fs::canonicalize(path).unwrap_or_else(|_| match (fs::read_link(path), path.parent()) {
-        (Ok(target), Some(folder)) => destination(&folder.join(target)),
-        _ => path.to_owned(),
-    })
+    const LINKS: usize = 40;
+    let mut path = path.to_owned();
+    for _ in 0..LINKS {
+        match (fs::canonicalize(&path), fs::read_link(&path), path.parent()) {
+            (Ok(found), ..) => return found,
+            (_, Ok(target), Some(folder)) => path = folder.join(target),
+            _ => break,
+        }
+    }
+    path
 }
 
 /// A file that is removed unless it gets its final name, even if the writing code panics.
@@ -112,6 +119,14 @@ mod tests {
             "a link to a file that is not there yet"
         );
         assert!(!fs::metadata(&device).unwrap().is_file());
+        let circle = folder.path().join("circle");
+        std::os::unix::fs::symlink("circle", &circle).unwrap();
+        write_atomic(&circle, |w| w.write_all(b"file")).unwrap();
+        assert_eq!(
+            fs::read(&circle).unwrap(),
+            b"file",
+            "a link that leads to itself is replaced"
+        );
     }
 
     #[test]

@@ -26,18 +26,18 @@ pub struct Pixels {
 }
 
 impl Pixels {
-    /// The pixels without their alpha, if all of it is opaque.
-    pub(crate) fn without_opaque_alpha(mut self) -> Self {
-        if self.channels == 4 && self.data.chunks_exact(4).all(|pixel| pixel[3] == 255) {
+    /// The pixels without their alpha, if they have any.
+    pub(crate) fn without_alpha(mut self) -> Self {
+        if self.channels == 4 {
+            self.data = self.data.chunks_exact(4).flat_map(|p| [p[0], p[1], p[2]]).collect();
             self.channels = 3;
-            self.data = self
-                .data
-                .chunks_exact(4)
-                .flat_map(|pixel| &pixel[..3])
-                .copied()
-                .collect();
         }
         self
+    }
+
+    /// Whether all pixels have an alpha of 255; false without alpha.
+    pub(crate) fn has_opaque_alpha(&self) -> bool {
+        self.channels == 4 && self.data.chunks_exact(4).all(|pixel| pixel[3] == 255)
     }
 }
 

@@ -91,9 +91,9 @@ impl PhotoFile {
                 ),
             ));
         }
-        let pixels = match self.keeps_alpha {
-            true => pixels,
-            false => pixels.without_opaque_alpha(),
+        let pixels = match !self.keeps_alpha && pixels.has_opaque_alpha() {
+            true => pixels.without_alpha(),
+            false => pixels,
         };
         let pixels = self.bring_to_size(pixels, self.part(divisor), size);
         let mut mask = self

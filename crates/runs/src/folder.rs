@@ -140,7 +140,7 @@ impl RunFolder {
     }
 
     /// As [`Self::check_free`], whoever holds the folder.
-    fn check_replaceable(path: &Path, overwrite: bool) -> Result<(), RunError> {
+    pub(crate) fn check_replaceable(path: &Path, overwrite: bool) -> Result<(), RunError> {
         if path.exists() && !path.is_dir() {
             return Err(RunError::Refused(format!(
                 "{} is a file: name a folder with --out",
@@ -480,9 +480,10 @@ pub fn is_moved(scene: &Path) -> bool {
 
 /// The file of the cameras of `scene`.
 fn cameras_file(scene: &Path) -> PathBuf {
-    Some(own_cameras(scene))
-        .filter(|own| own.is_file())
-        .unwrap_or_else(|| scene.with_file_name("cameras.json"))
+    match is_moved(scene) {
+        true => own_cameras(scene),
+        false => scene.with_file_name("cameras.json"),
+    }
 }
 
 /// Writes the cameras of the scene `to`, in the folder of a run: those of `from`, after moving the whole scene in the dataset's coordinates.
@@ -493,11 +494,8 @@ fn cameras_file(scene: &Path) -> PathBuf {
 pub fn write_own_cameras(from: &Path, to: &Path, moved: &Transform) -> Result<(), RunError> {
     let file = own_cameras(to);
     let is_in_run = to.with_file_name("cameras.json").is_file();
-    let text = match is_in_run && (is_moved(from) || !moved.is_identity()) {
-        true => cameras_moved(from, moved),
-        false => None,
-    };
-    match text {
+    let has_own = is_in_run && (is_moved(from) || !moved.is_identity());
+    match has_own.then(|| cameras_moved(from, moved)).flatten() {
         Some(text) => Ok(write_atomic(&file, |out| out.write_all(&text))?),
         None if is_in_run && file.is_file() => fs::remove_file(&file).map_err(RunError::io("remove", &file)),
         None => Ok(()),

@@ -38,8 +38,8 @@ impl ViewList {
         Self(dataset.views.iter().zip(parts).map(record).collect())
     }
 
-    /// Splits `dataset` as before: views of these names are held out again, and all others are trained on. Returns how many of the views
-    /// that were held out are missing; `None` if no name is known, in which case nothing changes.
+    /// Splits `dataset` as before: by their names, views are held out or left out again, and all others are trained on. Returns how many of
+    /// the views that were held out are missing; `None` if no name is known, in which case nothing changes.
     pub fn split(&self, dataset: &mut Dataset) -> Option<usize> {
         let part = |view: usize| self.0.get(&dataset.views[view].name).map(|record| record.part);
         let views = || 0..dataset.views.len();

@@ -94,7 +94,7 @@ impl Run {
         request.choose_background(&dataset)?;
         request.choose_length(&dataset);
         let (out, overwrite) = (&request.input.out, request.input.overwrite);
-        RunFolder::check_free(out, overwrite)?;
+        RunFolder::check_replaceable(out, overwrite)?;
         let held = FolderLock::take_existing(out)?;
         let paces = request.paces()?;
         let options = train_options(&request)?;

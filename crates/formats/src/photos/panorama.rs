@@ -143,7 +143,7 @@ impl PhotoEntry {
     /// # Errors
     /// When a file cannot be read, decoded or written.
     pub fn cut_panorama(&self, folder: &Path) -> Result<Vec<PanoramaFace>, FormatError> {
-        let pixels = opaque(self.read(self.width.max(self.height))?);
+        let pixels = self.read(self.width.max(self.height))?.without_alpha();
         let mask = self.read_mask(pixels.width, pixels.height)?.map(|data| Pixels {
             channels: 1,
             data,
@@ -174,15 +174,6 @@ impl PhotoEntry {
         }
         Ok(faces)
     }
-}
-
-/// The pixels without alpha.
-fn opaque(mut pixels: Pixels) -> Pixels {
-    if pixels.channels == 4 {
-        pixels.data = pixels.data.chunks_exact(4).flat_map(|p| [p[0], p[1], p[2]]).collect();
-        pixels.channels = 3;
-    }
-    pixels
 }
 
 fn write_jpeg(path: &Path, pixels: &Pixels) -> Result<(), FormatError> {

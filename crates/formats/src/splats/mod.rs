@@ -566,9 +566,6 @@ fn write_folder(meta: &Path, cloud: &GaussianCloud, options: &WriteOptions) -> R
         source,
     };
     let files = sog::encode(cloud, options).map_err(failed)?;
-    if let Some(folder) = meta.parent().filter(|folder| !folder.as_os_str().is_empty()) {
-        fs::create_dir_all(folder).map_err(failed)?;
-    }
     // Without it, an interrupted write leaves a folder that is no scene, rather than a mixture of two.
     if meta.exists() {
         fs::remove_file(meta).map_err(failed)?;

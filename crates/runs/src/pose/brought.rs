@@ -135,11 +135,6 @@ fn before(out: &Path) -> Files {
         .unwrap_or_default()
 }
 
-/// Whether both files have the same bytes.
-fn is_same(a: &Path, b: &Path) -> bool {
-    fs::read(a).is_ok_and(|a| fs::read(b).is_ok_and(|b| a == b))
-}
-
 /// Moves those of the dataset's `files` that exist into [`UNUSED`], where `a.2.png` stands beside an earlier `a.png`, and removes folders
 /// that become empty. Paths that lead outside of the dataset are ignored.
 pub(super) fn put_away(out: &Path, files: impl Iterator<Item = String>) -> Result<(), RunError> {
@@ -159,7 +154,7 @@ pub(super) fn put_away(out: &Path, files: impl Iterator<Item = String>) -> Resul
         let extension = wanted.extension().unwrap_or_default().to_string_lossy();
         let to = std::iter::once(wanted.clone())
             .chain((2u32..).map(|n| wanted.with_extension(format!("{n}.{extension}"))))
-            .find(|to| !to.exists() || is_same(to, &path))
+            .find(|to| !to.exists() || has_bytes_of(to, &path).unwrap_or(false))
             .expect("a free name");
         fs::rename(&path, &to).map_err(RunError::io("rename", &path))?;
         // A folder that is not empty stays.

@@ -15,8 +15,9 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-/// Number of photographs per thread whose features are extracted, and of pairs that are matched, between two checks of the time.
+/// Number of photographs per thread whose features are extracted between two checks of the time.
 const PHOTOS_PER_THREAD: usize = 32;
+/// Number of pairs that are matched between two checks of the time.
 const BATCH: usize = 1000;
 /// How often features and matches are saved while they are found.
 const SAVED_EVERY: Duration = Duration::from_secs(60);

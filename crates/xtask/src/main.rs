@@ -1,17 +1,19 @@
-//! Development only: `cargo xtask deps` and `cargo xtask files` check the project's rules and print one line per violation.
+//! Development only: `cargo xtask deps`, `files` and `scripts` check the project's rules and print one line per violation.
 #![forbid(unsafe_code)]
 
 mod deps;
 mod files;
 
 use anyhow::{Context, Result, bail, ensure};
+use std::path::PathBuf;
 use std::process::{Command, ExitCode};
 
 const USAGE: &str = "\
 usage: cargo xtask CHECK
   deps    imports between crates
   files   length and names of files; remainders of the step
-  all     both";
+  scripts the shell scripts parse
+  all     all of them";
 
 fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
@@ -19,8 +21,10 @@ fn main() -> ExitCode {
     let violations = match words[..] {
         ["deps"] => check_deps(),
         ["files"] => check_files(),
+        ["scripts"] => check_scripts(),
         ["all"] => check_deps().and_then(|mut violations| {
             violations.extend(check_files()?);
+            violations.extend(check_scripts()?);
             Ok(violations)
         }),
         _ => {
@@ -57,19 +61,59 @@ fn check_deps() -> Result<Vec<String>> {
 }
 
 fn check_files() -> Result<Vec<String>> {
-    let root = output(Command::new("git").args(["rev-parse", "--show-toplevel"]))?;
-    let root = std::path::Path::new(root.trim_end());
-    let list = output(Command::new("git").arg("-C").arg(root).args(["ls-files", "-z", "*.rs"]))?;
     let mut violations = Vec::new();
+    for (path, text) in tracked_files("*.rs")? {
+        violations.extend(files::violations(&path, &String::from_utf8_lossy(&text)));
+    }
+    Ok(violations)
+}
+
+/// Shell scripts that bash cannot parse. `.ci/run` is one of them, so nothing in it can find this out.
+fn check_scripts() -> Result<Vec<String>> {
+    let mut violations = Vec::new();
+    for (path, text) in tracked_files("*")? {
+        let first_line = text.split(|&byte| byte == b'\n').next().unwrap_or_default();
+        if !(first_line.starts_with(b"#!") && first_line.ends_with(b"sh")) {
+            continue;
+        }
+        let parsed = Command::new("bash")
+            .arg("-n")
+            .arg(repository()?.join(&path))
+            .output()
+            .context("cannot run bash")?;
+        if !parsed.status.success() {
+            violations.push(format!(
+                "{path}: {}",
+                String::from_utf8_lossy(&parsed.stderr).trim_end()
+            ));
+        }
+    }
+    Ok(violations)
+}
+
+fn repository() -> Result<PathBuf> {
+    let root = output(Command::new("git").args(["rev-parse", "--show-toplevel"]))?;
+    Ok(root.trim_end().into())
+}
+
+/// The tracked files whose paths match `pattern`, with their bytes; without those deleted in the working tree.
+fn tracked_files(pattern: &str) -> Result<Vec<(String, Vec<u8>)>> {
+    let root = repository()?;
+    let list = output(
+        Command::new("git")
+            .arg("-C")
+            .arg(&root)
+            .args(["ls-files", "-z", pattern]),
+    )?;
+    let mut found = Vec::new();
     for path in list.split('\0').filter(|path| !path.is_empty()) {
-        match std::fs::read_to_string(root.join(path)) {
-            Ok(text) => violations.extend(files::violations(path, &text)),
-            // Tracked but deleted in the working tree.
+        match std::fs::read(root.join(path)) {
+            Ok(bytes) => found.push((path.to_owned(), bytes)),
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => {}
             Err(error) => bail!("{path}: cannot read ({error})"),
         }
     }
-    Ok(violations)
+    Ok(found)
 }
 
 /// The standard output of a command that succeeds.

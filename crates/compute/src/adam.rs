@@ -38,15 +38,15 @@ impl AdamStep {
 }
 
 /// Items whose activity is counted together.
-pub const RUN: usize = 512;
+pub const RUN_LEN: usize = 512;
 /// Items of a parallel task.
-const TASK: usize = 32 * RUN;
+const ITEMS_PER_TASK: usize = 32 * RUN_LEN;
 
 /// Which items have a gradient in this step, and what the step does to the others. The flags (length: the stride) are nonzero
 /// where an item has one; elsewhere the gradient is not read.
 #[derive(Clone, Copy, Debug)]
 pub enum Active<'a> {
-    /// Items without a gradient keep parameters and moments. The second slice counts the items with a gradient in each [`RUN`];
+    /// Items without a gradient keep parameters and moments. The second slice counts the items with a gradient in each [`RUN_LEN`];
     /// runs without any are skipped.
     Sparse(&'a [f32], &'a [u32]),
     /// Items without a gradient step with a gradient of zero: their moments decay and still move them, as in the paper and in 3DGS.
@@ -95,7 +95,7 @@ pub fn adam(
         "same shapes"
     );
     let complete = match active {
-        Active::Sparse(flags, counts) => flags.len() == stride && counts.len() == stride.div_ceil(RUN),
+        Active::Sparse(flags, counts) => flags.len() == stride && counts.len() == stride.div_ceil(RUN_LEN),
         Active::Dense(flags) => flags.len() == stride,
         Active::All => true,
     };
@@ -117,10 +117,10 @@ pub fn adam(
         .filter(|(_, rate)| **rate != 0.0)
         .for_each(|((((parameters, gradients), first), second), rate)| {
             parameters
-                .par_chunks_mut(TASK)
-                .zip(gradients.par_chunks(TASK))
-                .zip(first.par_chunks_mut(TASK))
-                .zip(second.par_chunks_mut(TASK))
+                .par_chunks_mut(ITEMS_PER_TASK)
+                .zip(gradients.par_chunks(ITEMS_PER_TASK))
+                .zip(first.par_chunks_mut(ITEMS_PER_TASK))
+                .zip(second.par_chunks_mut(ITEMS_PER_TASK))
                 .enumerate()
                 .for_each(|(task, (((parameter, gradient), first), second))| {
                     level.run(AdamPiece {
@@ -128,7 +128,7 @@ pub fn adam(
                         gradient,
                         first,
                         second,
-                        from: task * TASK,
+                        from: task * ITEMS_PER_TASK,
                         len,
                         active,
                         rate: *rate,
@@ -192,7 +192,7 @@ struct AdamPiece<'a> {
     gradient: &'a [f32],
     first: &'a mut [f32],
     second: &'a mut [f32],
-    /// The piece's first item, a multiple of [`RUN`].
+    /// The piece's first item, a multiple of [`RUN_LEN`].
     from: usize,
     /// Number of items of the plane.
     len: usize,
@@ -211,7 +211,7 @@ impl Kernel for AdamPiece<'_> {
         S::F: Lanes<Scalar = f32>,
     {
         if let Active::Sparse(_, counts) = self.active {
-            let runs = &counts[self.from / RUN..][..self.parameter.len().div_ceil(RUN)];
+            let runs = &counts[self.from / RUN_LEN..][..self.parameter.len().div_ceil(RUN_LEN)];
             if runs.iter().all(|count| *count == 0) {
                 return;
             }
@@ -219,13 +219,13 @@ impl Kernel for AdamPiece<'_> {
         let rule = AdamRule::new(simd, &self.step, self.rate);
         let (zero, faintest) = (simd.splat(0.0), simd.splat(FAINTEST_MOMENT));
         let dense = matches!(self.active, Active::Dense(_));
-        for run in (0..self.parameter.len()).step_by(RUN) {
+        for run in (0..self.parameter.len()).step_by(RUN_LEN) {
             if let Active::Sparse(_, counts) = self.active
-                && counts[(self.from + run) / RUN] == 0
+                && counts[(self.from + run) / RUN_LEN] == 0
             {
                 continue;
             }
-            for at in (run..self.parameter.len().min(run + RUN)).step_by(S::LANES) {
+            for at in (run..self.parameter.len().min(run + RUN_LEN)).step_by(S::LANES) {
                 let item = self.from + at;
                 let on = match self.active {
                     Active::Sparse(flags, _) | Active::Dense(flags) => zero.lt(simd.load(&flags[item..])),
@@ -281,11 +281,12 @@ mod tests {
 
     /// Items have gradients in some steps only, each at its own pace, and NaN in the others; some items never have one.
     fn agrees_with_the_paper(dense: bool) {
-        let (n, rate, steps) = (3 * RUN + 37, 0.01, 12);
+        let (n, rate, steps) = (3 * RUN_LEN + 37, 0.01, 12);
         // The rate of each item.
         let of_item = |i: usize| [1.0, 0.25, 0.5][i % 3];
         // The items of the second run never have a gradient.
-        let present = |i: usize, t: u64| i / RUN != 1 && i % 5 != 4 && (t + i as u64).is_multiple_of(1 + i as u64 % 4);
+        let present =
+            |i: usize, t: u64| i / RUN_LEN != 1 && i % 5 != 4 && (t + i as u64).is_multiple_of(1 + i as u64 % 4);
         for level in Level::all() {
             let mut p = Planes::zeros(2, n);
             let (mut m, mut v) = (Planes::zeros(2, n), Planes::zeros(2, n));
@@ -297,7 +298,7 @@ mod tests {
                     .map(|i| f32::from(u8::from(i < n && present(i, t))))
                     .collect();
                 let counts: Vec<u32> = active
-                    .chunks(RUN)
+                    .chunks(RUN_LEN)
                     .map(|run| run.iter().filter(|flag| **flag != 0.0).count() as u32)
                     .collect();
                 for i in 0..n {

@@ -3,14 +3,14 @@
 use rayon::prelude::*;
 
 /// Values of a parallel task.
-const PIECE: usize = 1 << 14;
+const VALUES_PER_TASK: usize = 1 << 14;
 /// Values in the smallest page of memory, 4 KiB.
-const PAGE: usize = 1 << 10;
+const VALUES_PER_PAGE: usize = 1 << 10;
 
 /// Sets `to[k]` to `value(order[k])`.
 fn collect(to: &mut [f32], order: &[u32], value: impl Fn(usize) -> f32 + Sync) {
-    to.par_chunks_mut(PIECE)
-        .zip(order.par_chunks(PIECE))
+    to.par_chunks_mut(VALUES_PER_TASK)
+        .zip(order.par_chunks(VALUES_PER_TASK))
         .for_each(|(to, order)| {
             for (to, i) in to.iter_mut().zip(order) {
                 *to = value(*i as usize);
@@ -49,7 +49,11 @@ impl Planes {
     /// 3.5 GB of a copy of five million splats in training), but can be done on a background thread.
     pub fn resident(count: usize, len: usize) -> Self {
         let mut planes = Self::zeros(count, len);
-        planes.data.iter_mut().step_by(PAGE).for_each(|first| *first = 1.0);
+        planes
+            .data
+            .iter_mut()
+            .step_by(VALUES_PER_PAGE)
+            .for_each(|first| *first = 1.0);
         planes
     }
 
@@ -185,8 +189,8 @@ impl Planes {
             collect(scratch, order, value);
             let to = &mut self.data[c * new..(c + 1) * new];
             let (to, padding) = to.split_at_mut(order.len());
-            to.par_chunks_mut(PIECE)
-                .zip(scratch.par_chunks(PIECE))
+            to.par_chunks_mut(VALUES_PER_TASK)
+                .zip(scratch.par_chunks(VALUES_PER_TASK))
                 .for_each(|(to, from)| to.copy_from_slice(from));
             padding.fill(0.0);
         }
@@ -209,14 +213,16 @@ impl Planes {
         self.data.resize(from.data.len(), 0.0);
         (self.count, self.len, self.stride) = (from.count, from.len, from.stride);
         self.data
-            .par_chunks_mut(PIECE)
-            .zip(from.data.par_chunks(PIECE))
+            .par_chunks_mut(VALUES_PER_TASK)
+            .zip(from.data.par_chunks(VALUES_PER_TASK))
             .for_each(|(to, from)| to.copy_from_slice(from));
     }
 
     /// Sets all values to zero, including padding.
     pub fn clear(&mut self) {
-        self.data.par_chunks_mut(PIECE).for_each(|piece| piece.fill(0.0));
+        self.data
+            .par_chunks_mut(VALUES_PER_TASK)
+            .for_each(|piece| piece.fill(0.0));
     }
 
     /// Changes the shape, leaving values unspecified; reuses memory where possible.
@@ -256,9 +262,9 @@ mod tests {
     /// Shrinking, keeping and growing, over several pieces, compared with one item at a time; with 1 and with 2 threads.
     #[test]
     fn rearranging_in_place_gives_what_item_by_item_gives_with_any_number_of_threads() {
-        let n = 2 * PIECE + 40;
+        let n = 2 * VALUES_PER_TASK + 40;
         let items = |from: usize, n: usize| -> Vec<f32> { (from..from + 2 * n).map(|v| v as f32).collect() };
-        let added = [3, PIECE + 9].map(|n| Planes::from_interleaved(2, &items(1_000_000, n)));
+        let added = [3, VALUES_PER_TASK + 9].map(|n| Planes::from_interleaved(2, &items(1_000_000, n)));
         let total = n + added[0].len() + added[1].len();
         for (len, apart) in [(n / 3, 2), (n, 7), (total + 5, 11), (0, 1)] {
             // Every kind of index, out of order, with gaps and repetitions; some beyond the last item.

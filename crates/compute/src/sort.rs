@@ -22,7 +22,7 @@ pub fn payload(pair: &Pair) -> u32 {
 const DIGIT_BITS: u32 = 11;
 const BUCKETS: usize = 1 << DIGIT_BITS;
 /// Below this length one thread is faster than several.
-const PARALLEL_FROM: usize = 1 << 15;
+const MIN_PARALLEL_LEN: usize = 1 << 15;
 
 /// Sorts `items` by key, stably; `scratch` is resized to match and reused.
 ///
@@ -30,7 +30,7 @@ const PARALLEL_FROM: usize = 1 << 15;
 pub fn sort_by_key(items: &mut Vec<Pair>, scratch: &mut Vec<Pair>) {
     let n = items.len();
     scratch.resize_with(n, Pair::default);
-    let parts = if n < PARALLEL_FROM {
+    let parts = if n < MIN_PARALLEL_LEN {
         1
     } else {
         rayon::current_num_threads()
@@ -86,7 +86,7 @@ mod tests {
 
     #[test]
     fn matches_the_standard_stable_sort() {
-        for n in [0usize, 1, 2, 1000, 3 * PARALLEL_FROM + 17] {
+        for n in [0usize, 1, 2, 1000, 3 * MIN_PARALLEL_LEN + 17] {
             let mut state = 12345u32;
             let keys: Vec<u32> = (0..n)
                 .map(|_| {

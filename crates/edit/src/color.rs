@@ -12,7 +12,7 @@ pub(crate) struct ColorMap {
 /// Rec. 709 luma.
 const LUMA: [f64; 3] = [0.2126, 0.7152, 0.0722];
 /// Ratio of the gain of red to that of blue at a temperature of 1. A tint of 1 divides the gain of green by its square root.
-const STRONGEST: f64 = 1.5;
+const MAX_GAIN_RATIO: f64 = 1.5;
 /// sRGB is close to a power law with this exponent: a stop doubles the light, not the encoded value.
 const GAMMA: f64 = 2.2;
 
@@ -36,9 +36,9 @@ impl ColorMap {
         };
         let light = (exposure / GAMMA).exp2();
         let gains = [
-            light * STRONGEST.powf(0.5 * temperature),
-            light * STRONGEST.powf(-0.5 * tint),
-            light * STRONGEST.powf(-0.5 * temperature),
+            light * MAX_GAIN_RATIO.powf(0.5 * temperature),
+            light * MAX_GAIN_RATIO.powf(-0.5 * tint),
+            light * MAX_GAIN_RATIO.powf(-0.5 * temperature),
         ];
         let mut map = Self::IDENTITY;
         for row in 0..3 {

@@ -50,7 +50,7 @@ impl Draft {
     }
 
     /// The splats without the hidden ones, as they are drawn and written.
-    pub fn shown(&self) -> Cow<'_, GaussianCloud> {
+    pub fn visible_cloud(&self) -> Cow<'_, GaussianCloud> {
         match self.hidden.is_empty() {
             true => Cow::Borrowed(&self.cloud),
             false => Cow::Owned(gather(&self.cloud, &self.visible().indices())),

@@ -14,7 +14,7 @@ pub enum EditError {
     },
     /// The words of an edit are not understood.
     #[error("{0}")]
-    Words(String),
+    Syntax(String),
     /// A number is out of range.
     #[error("{name}: {message}")]
     Value {

@@ -6,37 +6,37 @@
 //! known, geometry alone decides.
 
 use crate::draft::median;
-use crate::judge::{Presumption, needed};
-use crate::sight::{Observer, SEEN};
-use crate::{Draft, Photographs, Selection, Taken};
+use crate::opacity_fit::{InitialOpacity, are_needed};
+use crate::visibility::{MIN_VISIBLE_WEIGHT, Observer};
+use crate::{Draft, LoadedPhotographs, Photographs, Selection};
 use irradia_splat::{Nearest, sigmoid};
 use rayon::prelude::*;
 
 /// Spacing is the distance to the nearest neighbour of this rank.
-const NEIGHBOURS: usize = 6;
+const NEIGHBOUR_RANK: usize = 6;
 /// Maximum spacing, in units of its size, of a splat that is part of a surface.
-const SUPPORTED: f32 = 2.0;
+const MAX_SURFACE_SPACING: f32 = 2.0;
 
 /// Spacing of an isolated splat, in units of its size and in units of the scene's median spacing.
-const ISOLATED: [f32; 2] = [12.0, 4.0];
+const MIN_ISOLATED_SPACINGS: [f32; 2] = [12.0, 4.0];
 /// Ratio of the largest to the middle standard deviation of a needle, and its size relative to the distance of the nearest camera.
-const NEEDLE: [f32; 2] = [15.0, 0.1];
+const MIN_NEEDLE_RATIOS: [f32; 2] = [15.0, 0.1];
 /// Size of a huge splat, relative to the distance of the nearest camera.
-const HUGE: f32 = 0.6;
+const MIN_HUGE_SIZE: f32 = 0.6;
 /// The same for a splat that is huge among smaller ones, and its size in units of spacing: the size of a background's splats is about their
 /// spacing.
-const HUGE_AMONG: [f32; 2] = [0.35, 4.0];
+const MIN_HUGE_AMONG_SMALL: [f32; 2] = [0.35, 4.0];
 /// Minimum score at which photographs decide.
-const SUSPICIOUS: f32 = 0.4;
+const SUSPICION_THRESHOLD: f32 = 0.4;
 /// Minimum score of a splat in front of what views show at which photographs are not consulted: the one photograph that the splat explains
 /// would count in its favour.
-const CERTAIN: f32 = 1.5;
+const CERTAINTY_THRESHOLD: f32 = 1.5;
 /// Spacing, in units of its size, of a floater that no view shows.
-const UNSEEN: f32 = 6.0;
+const MIN_UNSEEN_SPACING: f32 = 6.0;
 /// Minimum values for a splat in front of what views show: the share of views that see past it, its spacing in units of its size, the
 /// product of both, its opacity, and the largest sum of its blending weights in a view as a share of the view's pixels. Fainter and
 /// smaller splats are numerous and harmless, and in a forward-facing capture of leaves they are leaves.
-const IN_FRONT: [f32; 5] = [0.4, 2.5, 2.0, 0.05, 1e-4];
+const MIN_IN_FRONT_VALUES: [f32; 5] = [0.4, 2.5, 2.0, 0.05, 1e-4];
 
 /// How strongly each reason suggests that a splat is a floater.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -84,16 +84,16 @@ impl FloaterScores {
 pub fn floater_scores(draft: &Draft) -> Vec<FloaterScores> {
     let cloud = &draft.cloud;
     let shown = draft.visible();
-    let numbers = shown.indices();
-    if numbers.len() <= NEIGHBOURS {
+    let indices = shown.indices();
+    if indices.len() <= NEIGHBOUR_RANK {
         return vec![FloaterScores::default(); draft.len()];
     }
-    let means: Vec<[f32; 3]> = numbers.iter().map(|i| cloud.means[*i as usize]).collect();
+    let means: Vec<[f32; 3]> = indices.iter().map(|i| cloud.means[*i as usize]).collect();
     let spacings = spacings(&means);
-    let usual = median(spacings.clone()).max(f32::MIN_POSITIVE);
+    let median_spacing = median(spacings.clone()).max(f32::MIN_POSITIVE);
     // Without cameras, sizes are relative to the scene.
     let extent = draft.extent() as f32;
-    let reach = |mean: [f32; 3]| {
+    let camera_distance = |mean: [f32; 3]| {
         let eyes = draft
             .cameras
             .iter()
@@ -105,61 +105,79 @@ pub fn floater_scores(draft: &Draft) -> Vec<FloaterScores> {
     };
     let mut scores = vec![FloaterScores::default(); draft.len()];
     // Spacing in units of size.
-    let mut apart = vec![0.0f32; draft.len()];
-    let geometry: Vec<(FloaterScores, f32)> = (0..numbers.len())
+    let mut relative_spacing = vec![0.0f32; draft.len()];
+    let geometry: Vec<(FloaterScores, f32)> = (0..indices.len())
         .into_par_iter()
         .with_min_len(256)
         .map(|at| {
-            let mut sizes = cloud.log_scales[numbers[at] as usize].map(f32::exp);
+            let mut sizes = cloud.log_scales[indices[at] as usize].map(f32::exp);
             sizes.sort_unstable_by(f32::total_cmp);
             let [_, middle, largest] = sizes;
-            let (spacing, reach) = (spacings[at], reach(means[at]).max(f32::MIN_POSITIVE));
-            let apart = spacing / largest.max(f32::MIN_POSITIVE);
+            let (spacing, camera_distance) = (spacings[at], camera_distance(means[at]).max(f32::MIN_POSITIVE));
+            let relative_spacing = spacing / largest.max(f32::MIN_POSITIVE);
             let elongation = largest / middle.max(f32::MIN_POSITIVE);
             let scores = FloaterScores {
-                isolated: (apart / ISOLATED[0]).min(spacing / usual / ISOLATED[1]),
-                needle: (elongation / NEEDLE[0]).min(largest / reach / NEEDLE[1]),
-                huge: (largest / reach / HUGE).max((largest / reach / HUGE_AMONG[0]).min(1.0 / apart / HUGE_AMONG[1])),
+                isolated: (relative_spacing / MIN_ISOLATED_SPACINGS[0])
+                    .min(spacing / median_spacing / MIN_ISOLATED_SPACINGS[1]),
+                needle: (elongation / MIN_NEEDLE_RATIOS[0]).min(largest / camera_distance / MIN_NEEDLE_RATIOS[1]),
+                huge: (largest / camera_distance / MIN_HUGE_SIZE).max(
+                    (largest / camera_distance / MIN_HUGE_AMONG_SMALL[0])
+                        .min(1.0 / relative_spacing / MIN_HUGE_AMONG_SMALL[1]),
+                ),
                 ..FloaterScores::default()
             };
-            (scores, apart)
+            (scores, relative_spacing)
         })
         .collect();
-    for (i, (found, distance)) in numbers.iter().zip(geometry) {
-        (scores[*i as usize], apart[*i as usize]) = (found, distance);
+    for (i, (found, distance)) in indices.iter().zip(geometry) {
+        (scores[*i as usize], relative_spacing[*i as usize]) = (found, distance);
     }
     if !draft.cameras.is_empty() {
-        score_views(draft, &shown, &apart, &mut scores);
+        score_views(draft, &shown, &relative_spacing, &mut scores);
     }
-    if let Some(taken) = draft.photographs.as_ref().and_then(Photographs::taken) {
-        ask_photographs(draft, taken, &shown, &mut scores);
+    if let Some(photographs) = draft.photographs.as_ref().and_then(Photographs::load) {
+        decide_by_photographs(draft, photographs, &shown, &mut scores);
     }
     scores
 }
 
 /// Photographs decide about huge splats and needles: by shape alone, part of a plain wall or of a table's edge looks like one, and a veil
 /// far behind everything does not. They also decide about splats that are nearly floaters for other reasons.
-fn ask_photographs(draft: &Draft, taken: &Taken, shown: &Selection, scores: &mut [FloaterScores]) {
+fn decide_by_photographs(
+    draft: &Draft,
+    photographs: &LoadedPhotographs,
+    shown: &Selection,
+    scores: &mut [FloaterScores],
+) {
     let shape = |scores: &FloaterScores| scores.huge.max(scores.needle);
     let other = |scores: &FloaterScores| scores.isolated.max(scores.unseen).max(scores.in_front);
-    let is_certain = |scores: &FloaterScores| scores.isolated.max(scores.unseen).max(scores.in_front / CERTAIN) >= 1.0;
+    let is_certain = |scores: &FloaterScores| {
+        scores
+            .isolated
+            .max(scores.unseen)
+            .max(scores.in_front / CERTAINTY_THRESHOLD)
+            >= 1.0
+    };
     // Certain floaters are left out, since the fit of the suspects would compensate for them.
     let mut rest = Selection::of(draft.len(), |i| {
-        shown.contains(i) && (!is_certain(&scores[i]) || shape(&scores[i]) >= SUSPICIOUS)
+        shown.contains(i) && (!is_certain(&scores[i]) || shape(&scores[i]) >= SUSPICION_THRESHOLD)
     });
     // First the splats with a suspicious shape, while no other splat can change to make room for them; then what they hid, without them.
-    for (least, presumption) in [(1.0, Presumption::Guilty), (SUSPICIOUS, Presumption::Innocent)] {
+    for (least, initial) in [
+        (1.0, InitialOpacity::Hidden),
+        (SUSPICION_THRESHOLD, InitialOpacity::Trained),
+    ] {
         let suspects = Selection::of(draft.len(), |i| {
-            rest.contains(i) && (shape(&scores[i]) >= least || least < 1.0 && other(&scores[i]) >= SUSPICIOUS)
+            rest.contains(i) && (shape(&scores[i]) >= least || least < 1.0 && other(&scores[i]) >= SUSPICION_THRESHOLD)
         });
-        for (i, is_needed) in needed(draft, taken, &rest, &suspects, presumption) {
+        for (i, is_needed) in are_needed(draft, photographs, &rest, &suspects, initial) {
             let scores = &mut scores[i as usize];
             if !is_needed {
                 *scores.strongest() = scores.score().max(1.0);
                 rest.set(i as usize, false);
             } else if least < 1.0 {
                 for reason in [&mut scores.huge, &mut scores.needle, &mut scores.in_front] {
-                    *reason = reason.min(SUSPICIOUS);
+                    *reason = reason.min(SUSPICION_THRESHOLD);
                 }
             }
         }
@@ -167,12 +185,14 @@ fn ask_photographs(draft: &Draft, taken: &Taken, shown: &Selection, scores: &mut
 }
 
 /// Scores splats by the views: whether any sees them, and whether they are in front of what views show.
-fn score_views(draft: &Draft, shown: &Selection, apart: &[f32], scores: &mut [FloaterScores]) {
+fn score_views(draft: &Draft, shown: &Selection, relative_spacing: &[f32], scores: &mut [FloaterScores]) {
     let cloud = &draft.cloud;
     // Huge splats and needles would veil everything else.
     let is_whole = |i: usize| shown.contains(i) && scores[i].huge.max(scores[i].needle) < 1.0;
     let whole = Selection::of(draft.len(), is_whole);
-    let solid = Selection::of(draft.len(), |i| whole.contains(i) && apart[i] <= SUPPORTED);
+    let solid = Selection::of(draft.len(), |i| {
+        whole.contains(i) && relative_spacing[i] <= MAX_SURFACE_SPACING
+    });
     let (mut all, mut surfaces) = (Observer::new(draft, &whole), Observer::new(draft, &solid));
     let mut votes = vec![Votes::default(); draft.len()];
     for camera in &draft.cameras {
@@ -184,7 +204,7 @@ fn score_views(draft: &Draft, shown: &Selection, apart: &[f32], scores: &mut [Fl
             .with_min_len(1024)
             .enumerate()
             .for_each(|(i, votes)| {
-                votes.seen |= weights[i] >= SEEN;
+                votes.seen |= weights[i] >= MIN_VISIBLE_WEIGHT;
                 votes.weight = votes.weight.max(weights[i] / pixels);
                 if let Some([shown, own]) = depths.at(cloud.means[i].into()) {
                     let largest = cloud.log_scales[i].iter().fold(f32::NEG_INFINITY, |m, s| m.max(*s));
@@ -194,11 +214,24 @@ fn score_views(draft: &Draft, shown: &Selection, apart: &[f32], scores: &mut [Fl
     }
     for (i, (scores, votes)) in scores.iter_mut().zip(&votes).enumerate() {
         if whole.contains(i) {
-            scores.unseen = if votes.seen { 0.0 } else { apart[i] / UNSEEN };
+            scores.unseen = if votes.seen {
+                0.0
+            } else {
+                relative_spacing[i] / MIN_UNSEEN_SPACING
+            };
             let opacity = sigmoid(cloud.opacity_logits[i]);
             let share = votes.in_front_share();
-            let found = [share, apart[i], share * apart[i], opacity, votes.weight];
-            let ratios = found.iter().zip(IN_FRONT).map(|(found, needed)| found / needed);
+            let found = [
+                share,
+                relative_spacing[i],
+                share * relative_spacing[i],
+                opacity,
+                votes.weight,
+            ];
+            let ratios = found
+                .iter()
+                .zip(MIN_IN_FRONT_VALUES)
+                .map(|(found, needed)| found / needed);
             scores.in_front = ratios.fold(f32::INFINITY, f32::min);
         }
     }
@@ -237,6 +270,6 @@ impl Votes {
 /// Distance of each point to its sixth neighbour.
 fn spacings(means: &[[f32; 3]]) -> Vec<f32> {
     let tree = Nearest::new(means);
-    let spacing = |mean: &[f32; 3]| tree.of::<{ NEIGHBOURS + 1 }>(*mean)[NEIGHBOURS].0.sqrt();
+    let spacing = |mean: &[f32; 3]| tree.of::<{ NEIGHBOUR_RANK + 1 }>(*mean)[NEIGHBOUR_RANK].0.sqrt();
     means.par_iter().with_min_len(256).map(spacing).collect()
 }

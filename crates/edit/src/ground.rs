@@ -7,19 +7,19 @@ use irradia_splat::sigmoid;
 use rayon::prelude::*;
 
 /// Number of planes that are scored, among those through three points that can be the ground.
-const TRIALS: usize = 2000;
+const MAX_CANDIDATE_PLANES: usize = 2000;
 /// Number of triples of points that are drawn: few of them lie on a plane below the cameras.
-const DRAWS: usize = 200_000;
+const MAX_DRAWS: usize = 200_000;
 /// Number of splats sampled, at random in proportion to opacity times area.
-const SAMPLES: usize = 20_000;
+const SAMPLED_SPLATS: usize = 20_000;
 /// Half the thickness of the plane, as a fraction of the median distance of splats from their centre.
-const THICKNESS: f64 = 0.02;
+const HALF_THICKNESS: f64 = 0.02;
 /// Cosine of the largest angle between the ground's normal and the cameras' mean up: people tilt their cameras.
-const MOST_TILT: f64 = 0.7;
+const MIN_UP_COSINE: f64 = 0.7;
 /// Sizes are clamped to this fraction of the scene's: the background's splats are huge.
-const LARGEST: f64 = 0.05;
+const MAX_SPLAT_SIZE: f64 = 0.05;
 /// Minimum share of the sampled splats that a ground contains.
-const LEAST: f64 = 0.05;
+const MIN_INLIER_SHARE: f64 = 0.05;
 
 /// The up direction of a scene, and its ground.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -42,8 +42,8 @@ pub fn ground(draft: &Draft) -> Option<Ground> {
         .map(|pose| (pose.rotation * glam::Vec3::NEG_Y).as_dvec3());
     let up = up.sum::<DVec3>().normalize_or(DVec3::NEG_Y);
     let eyes: Vec<DVec3> = cameras.map(|pose| pose.position.as_dvec3()).collect();
-    let points = sample(draft);
-    let plane = densest(&points, &eyes, up);
+    let points = sample_points(draft);
+    let plane = densest_plane(&points, &eyes, up);
     let world = draft.cloud.world_from_dataset;
     Some(Ground {
         up: plane.map_or(up, |(normal, _)| normal).to_array(),
@@ -52,11 +52,11 @@ pub fn ground(draft: &Draft) -> Option<Ground> {
 }
 
 /// Centres of splats that are not hidden, world, drawn with replacement in proportion to opacity and area.
-fn sample(draft: &Draft) -> Vec<DVec3> {
+fn sample_points(draft: &Draft) -> Vec<DVec3> {
     let cloud = &draft.cloud;
     let mut sums = Vec::with_capacity(draft.len());
     let mut sum = 0.0f64;
-    let largest = LARGEST * draft.extent();
+    let largest = MAX_SPLAT_SIZE * draft.extent();
     for (i, opacity_logit) in cloud.opacity_logits.iter().enumerate() {
         let mut sizes = cloud.log_scales[i].map(|scale| f64::from(scale).exp().min(largest));
         sizes.sort_unstable_by(f64::total_cmp);
@@ -70,7 +70,7 @@ fn sample(draft: &Draft) -> Vec<DVec3> {
         return Vec::new();
     }
     let mut rng = Rng::new(1, 0);
-    (0..SAMPLES)
+    (0..SAMPLED_SPLATS)
         .map(|_| {
             let at = f64::from(rng.uniform()) * sum;
             let i = sums.partition_point(|sum| *sum <= at).min(sums.len() - 1);
@@ -81,46 +81,46 @@ fn sample(draft: &Draft) -> Vec<DVec3> {
 
 /// Unit normal and a point of the plane with most of `points` within its thickness (RANSAC, Fischler and Bolles 1981), refined by least
 /// squares over them.
-fn densest(points: &[DVec3], eyes: &[DVec3], up: DVec3) -> Option<(DVec3, DVec3)> {
+fn densest_plane(points: &[DVec3], eyes: &[DVec3], up: DVec3) -> Option<(DVec3, DVec3)> {
     if points.len() < 3 {
         return None;
     }
     let center = points.iter().copied().sum::<DVec3>() / points.len() as f64;
     let mut distances: Vec<f64> = points.iter().map(|p| p.distance(center)).collect();
     let middle = distances.len() / 2;
-    let thickness = THICKNESS * *distances.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let thickness = HALF_THICKNESS * *distances.select_nth_unstable_by(middle, f64::total_cmp).1;
     let is_near = |(normal, origin): &(DVec3, DVec3), p: &DVec3| (*p - *origin).dot(*normal).abs() <= thickness;
     let is_ground = |(normal, origin): &(DVec3, DVec3)| {
         let above = eyes.iter().filter(|eye| (**eye - *origin).dot(*normal) > 0.0).count();
-        normal.dot(up) >= MOST_TILT && 10 * above >= 9 * eyes.len()
+        normal.dot(up) >= MIN_UP_COSINE && 10 * above >= 9 * eyes.len()
     };
     let mut rng = Rng::new(2, 0);
-    let trials: Vec<(DVec3, DVec3)> = (0..DRAWS)
+    let candidates: Vec<(DVec3, DVec3)> = (0..MAX_DRAWS)
         .filter_map(|_| {
             let [a, b, c] = [(); 3].map(|()| points[rng.below(points.len() as u32) as usize]);
             let normal = (b - a).cross(c - a).try_normalize()?;
             let plane = (normal * normal.dot(up).signum(), a);
             is_ground(&plane).then_some(plane)
         })
-        .take(TRIALS)
+        .take(MAX_CANDIDATE_PLANES)
         .collect();
     let score = |plane: &(DVec3, DVec3)| points.iter().filter(|p| is_near(plane, p)).count();
-    let scores: Vec<usize> = trials.par_iter().map(score).collect();
+    let scores: Vec<usize> = candidates.par_iter().map(score).collect();
     // The first of those with equal scores.
-    let best = (0..trials.len()).max_by_key(|i| (scores[*i], usize::MAX - i))?;
-    let mut plane = trials[best];
+    let best = (0..candidates.len()).max_by_key(|i| (scores[*i], usize::MAX - i))?;
+    let mut plane = candidates[best];
     for _ in 0..3 {
         let inliers: Vec<DVec3> = points.iter().copied().filter(|p| is_near(&plane, p)).collect();
-        let Some(refined) = fitted(&inliers, plane.0).filter(is_ground) else {
+        let Some(refined) = fit_plane(&inliers, plane.0).filter(is_ground) else {
             break;
         };
         plane = refined;
     }
-    (score(&plane) as f64 >= LEAST * points.len() as f64).then_some(plane)
+    (score(&plane) as f64 >= MIN_INLIER_SHARE * points.len() as f64).then_some(plane)
 }
 
 /// The least-squares plane, with its normal on the side of `toward`.
-fn fitted(points: &[DVec3], toward: DVec3) -> Option<(DVec3, DVec3)> {
+fn fit_plane(points: &[DVec3], toward: DVec3) -> Option<(DVec3, DVec3)> {
     if points.len() < 3 {
         return None;
     }

@@ -12,7 +12,7 @@ const MAX_DEGREE: usize = 4;
 /// Basis functions up to [`MAX_DEGREE`].
 const COEFFICIENTS: usize = 25;
 /// Number of directions at which bands are sampled, more than twice the number of functions in a band.
-const SAMPLES: usize = 32;
+const SAMPLED_DIRECTIONS: usize = 32;
 
 /// Band 4, with the signs of the Inria code's basis as gsplat extends it.
 const C4: [f64; 9] = [
@@ -70,9 +70,9 @@ impl BandRotation {
     /// The matrices of a rotation of the scene.
     pub fn new(rotation: DQuat) -> Self {
         // Evenly distributed over the sphere: a Fibonacci lattice.
-        let directions: Vec<DVec3> = (0..SAMPLES)
+        let directions: Vec<DVec3> = (0..SAMPLED_DIRECTIONS)
             .map(|i| {
-                let z = 1.0 - (2 * i + 1) as f64 / SAMPLES as f64;
+                let z = 1.0 - (2 * i + 1) as f64 / SAMPLED_DIRECTIONS as f64;
                 let angle = i as f64 * std::f64::consts::PI * (3.0 - 5f64.sqrt());
                 let radius = (1.0 - z * z).sqrt();
                 DVec3::new(radius * angle.cos(), radius * angle.sin(), z)

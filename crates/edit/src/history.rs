@@ -1,6 +1,6 @@
 use crate::draft::{append, gather, scatter, truncate};
 use crate::plan::{Change, Plan};
-use crate::{Applied, Draft, Edit, EditError, EditList, Open, Photographs, Provenance, Selection};
+use crate::{Applied, Draft, Edit, EditError, EditList, OpenScene, Photographs, Provenance, Selection};
 use irradia_scene::{Camera, GaussianCloud, Similarity};
 
 /// A scene and the edits applied to it, which can be undone one by one. Only the splats that an edit changed or removed are kept for that.
@@ -24,8 +24,8 @@ use irradia_scene::{Camera, GaussianCloud, Similarity};
 /// ```
 pub struct History {
     draft: Draft,
-    done: Vec<(Edit, Undo)>,
-    undone: Vec<Edit>,
+    undo_stack: Vec<(Edit, Undo)>,
+    redo_stack: Vec<Edit>,
 }
 
 impl History {
@@ -33,8 +33,8 @@ impl History {
     pub fn new(draft: Draft) -> Self {
         Self {
             draft,
-            done: Vec::new(),
-            undone: Vec::new(),
+            undo_stack: Vec::new(),
+            redo_stack: Vec::new(),
         }
     }
 
@@ -46,23 +46,23 @@ impl History {
     /// The edits applied and not undone, with all automatically determined values filled in.
     pub fn list(&self) -> EditList {
         EditList {
-            edits: self.done.iter().map(|(edit, _)| edit.clone()).collect(),
+            edits: self.undo_stack.iter().map(|(edit, _)| edit.clone()).collect(),
             ..EditList::default()
         }
     }
 
     /// Number of edits that can be redone.
-    pub fn undone(&self) -> usize {
-        self.undone.len()
+    pub fn redo_count(&self) -> usize {
+        self.redo_stack.len()
     }
 
     /// Applies an edit, after which undone edits can no longer be redone. If it fails, nothing changes.
     ///
     /// # Errors
     /// Those of [`apply`](crate::apply).
-    pub fn apply(&mut self, edit: &Edit, open: Open) -> Result<Applied, EditError> {
-        let applied = self.make(edit, open)?;
-        self.undone.clear();
+    pub fn apply(&mut self, edit: &Edit, open: OpenScene) -> Result<Applied, EditError> {
+        let applied = self.perform(edit, open)?;
+        self.redo_stack.clear();
         Ok(applied)
     }
 
@@ -70,25 +70,25 @@ impl History {
     ///
     /// # Errors
     /// Those of [`apply`](crate::apply).
-    pub fn redo(&mut self, open: Open) -> Option<Result<Applied, EditError>> {
-        let edit = self.undone.last()?.clone();
-        Some(self.make(&edit, open).inspect(|_| {
-            self.undone.pop();
+    pub fn redo(&mut self, open: OpenScene) -> Option<Result<Applied, EditError>> {
+        let edit = self.redo_stack.last()?.clone();
+        Some(self.perform(&edit, open).inspect(|_| {
+            self.redo_stack.pop();
         }))
     }
 
     /// Undoes the last edit, bit for bit. Returns where the splats come from; `None` if there is no edit.
     pub fn undo(&mut self) -> Option<Provenance> {
-        let (edit, undo) = self.done.pop()?;
-        self.undone.push(edit);
+        let (edit, undo) = self.undo_stack.pop()?;
+        self.redo_stack.push(edit);
         Some(undo.apply(&mut self.draft))
     }
 
-    fn make(&mut self, edit: &Edit, open: Open) -> Result<Applied, EditError> {
+    fn perform(&mut self, edit: &Edit, open: OpenScene) -> Result<Applied, EditError> {
         let plan = Plan::new(&self.draft, edit, open)?;
         let undo = Undo::of(&plan.change, &self.draft);
-        let applied = plan.carry_out(&mut self.draft);
-        self.done.push((applied.edit.clone(), undo));
+        let applied = plan.execute(&mut self.draft);
+        self.undo_stack.push((applied.edit.clone(), undo));
         Ok(applied)
     }
 }

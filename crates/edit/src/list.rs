@@ -1,15 +1,15 @@
 //! Edits as data: a list that can be written, read, replayed and shortened.
 
 use crate::EditError;
-use crate::shape::{SelectStep, direction, finite, positive};
+use crate::shape::{SelectStep, check_direction, check_finite, check_positive};
 use serde::{Deserialize, Serialize};
 
 /// The version of the layout that is written and read.
 const VERSION: u32 = 1;
 /// Maximum number of edits in a list, and of steps in a selection.
-const MOST: usize = 10_000;
+const MAX_ITEMS: usize = 10_000;
 /// Maximum size of a list in bytes.
-const MOST_BYTES: usize = 64 << 20;
+const MAX_LIST_BYTES: usize = 64 << 20;
 
 /// Edits in the order of application. Each is in the coordinates of the scene after the edits before it.
 ///
@@ -213,9 +213,9 @@ impl EditList {
     /// # Errors
     /// One line that names the edit, when it is not TOML of this layout or a number is out of range.
     pub fn parse(text: &str) -> Result<Self, EditError> {
-        if text.len() > MOST_BYTES {
+        if text.len() > MAX_LIST_BYTES {
             return Err(EditError::List(format!(
-                "it has {} bytes, at most {MOST_BYTES} are read",
+                "it has {} bytes, at most {MAX_LIST_BYTES} are read",
                 text.len()
             )));
         }
@@ -256,9 +256,9 @@ impl EditList {
     /// # Errors
     /// [`EditError::InList`] for the first that is not.
     pub fn check(&self) -> Result<(), EditError> {
-        if self.edits.len() > MOST {
+        if self.edits.len() > MAX_ITEMS {
             return Err(EditError::List(format!(
-                "it has {} edits, at most {MOST} are allowed",
+                "it has {} edits, at most {MAX_ITEMS} are allowed",
                 self.edits.len()
             )));
         }
@@ -289,7 +289,7 @@ impl Edit {
     pub(crate) fn from_table(table: toml::Table) -> Result<Self, EditError> {
         let edit: Self = table
             .try_into()
-            .map_err(|error: toml::de::Error| EditError::Words(error.message().replace('\n', " ")))?;
+            .map_err(|error: toml::de::Error| EditError::Syntax(error.message().replace('\n', " ")))?;
         edit.check()?;
         Ok(edit)
     }
@@ -300,12 +300,12 @@ impl Edit {
     /// One line that names the key.
     pub fn check(&self) -> Result<(), EditError> {
         let name = self.op.name();
-        match (&self.select, self.op.needs()) {
-            (None, Needs::Selection) => {
+        match (&self.select, self.op.scope()) {
+            (None, Scope::Selection) => {
                 let example = "such as: sphere center=0,0,0 radius=1";
                 return Err(EditError::Selection(format!("{name} needs a selection, {example}")));
             }
-            (Some(_), Needs::Scene) => {
+            (Some(_), Scope::Scene) => {
                 return Err(EditError::Selection(format!(
                     "{name} applies to the whole scene and takes no selection"
                 )));
@@ -313,30 +313,30 @@ impl Edit {
             _ => {}
         }
         let steps = self.select.as_deref().unwrap_or_default();
-        if steps.len() > MOST {
-            let message = format!("has {} steps, at most {MOST} are allowed", steps.len());
+        if steps.len() > MAX_ITEMS {
+            let message = format!("has {} steps, at most {MAX_ITEMS} are allowed", steps.len());
             return Err(EditError::value(format!("{name} select"), message));
         }
         steps.iter().try_for_each(SelectStep::check)?;
         match &self.op {
-            Operation::Move { by } | Operation::Duplicate { by } => finite(&format!("{name} by"), by),
+            Operation::Move { by } | Operation::Duplicate { by } => check_finite(&format!("{name} by"), by),
             Operation::Rotate { axis, degrees, about } => {
-                direction("rotate axis", axis)?;
-                finite("rotate degrees", &[*degrees])?;
-                finite("rotate about", about.as_ref().map_or(&[], |v| v))
+                check_direction("rotate axis", axis)?;
+                check_finite("rotate degrees", &[*degrees])?;
+                check_finite("rotate about", about.as_ref().map_or(&[], |v| v))
             }
             Operation::Scale { factor, about } => {
-                positive("scale factor", *factor)?;
-                finite("scale about", about.as_ref().map_or(&[], |v| v))
+                check_positive("scale factor", *factor)?;
+                check_finite("scale about", about.as_ref().map_or(&[], |v| v))
             }
             Operation::Upright { up, ground, .. } => {
-                up.as_ref().map_or(Ok(()), |up| direction("upright up", up))?;
-                finite("upright ground", ground.as_ref().map_or(&[], |v| v))
+                up.as_ref().map_or(Ok(()), |up| check_direction("upright up", up))?;
+                check_finite("upright ground", ground.as_ref().map_or(&[], |v| v))
             }
             Operation::SetLength { from, to, length } => {
-                direction("set-length to - from", &std::array::from_fn(|c| to[c] - from[c]))?;
-                finite("set-length from", from)?;
-                positive("set-length length", *length)
+                check_direction("set-length to - from", &std::array::from_fn(|c| to[c] - from[c]))?;
+                check_finite("set-length from", from)?;
+                check_positive("set-length length", *length)
             }
             Operation::Recolor {
                 exposure,
@@ -345,13 +345,13 @@ impl Edit {
                 saturation,
                 contrast,
             } => {
-                within("recolor exposure", *exposure, -20.0, 20.0)?;
-                within("recolor temperature", *temperature, -1.0, 1.0)?;
-                within("recolor tint", *tint, -1.0, 1.0)?;
-                within("recolor saturation", *saturation, 0.0, 100.0)?;
-                within("recolor contrast", *contrast, 0.0, 100.0)
+                check_within("recolor exposure", *exposure, -20.0, 20.0)?;
+                check_within("recolor temperature", *temperature, -1.0, 1.0)?;
+                check_within("recolor tint", *tint, -1.0, 1.0)?;
+                check_within("recolor saturation", *saturation, 0.0, 100.0)?;
+                check_within("recolor contrast", *contrast, 0.0, 100.0)
             }
-            Operation::Opacity { factor } => within("opacity factor", *factor, 0.0, 1e6),
+            Operation::Opacity { factor } => check_within("opacity factor", *factor, 0.0, 1e6),
             Operation::Merge { file } => {
                 let is_plain = !file.is_empty() && file.len() <= 4096 && !file.chars().any(char::is_control);
                 match is_plain {
@@ -384,7 +384,7 @@ impl Edit {
     }
 }
 
-fn within(name: &str, value: f64, low: f64, high: f64) -> Result<(), EditError> {
+fn check_within(name: &str, value: f64, low: f64, high: f64) -> Result<(), EditError> {
     match (low..=high).contains(&value) {
         true => Ok(()),
         false => Err(EditError::value(name, format!("must be {low} to {high}"))),
@@ -392,7 +392,7 @@ fn within(name: &str, value: f64, low: f64, high: f64) -> Result<(), EditError> 
 }
 
 /// What an operation applies to.
-enum Needs {
+enum Scope {
     Selection,
     Scene,
     Either,
@@ -422,11 +422,11 @@ impl Operation {
         }
     }
 
-    fn needs(&self) -> Needs {
+    fn scope(&self) -> Scope {
         match self {
-            Self::Delete {} | Self::Keep {} | Self::Hide {} | Self::Lock {} | Self::Split { .. } => Needs::Selection,
-            Self::Merge { .. } | Self::Upright { .. } | Self::SetLength { .. } => Needs::Scene,
-            _ => Needs::Either,
+            Self::Delete {} | Self::Keep {} | Self::Hide {} | Self::Lock {} | Self::Split { .. } => Scope::Selection,
+            Self::Merge { .. } | Self::Upright { .. } | Self::SetLength { .. } => Scope::Scene,
+            _ => Scope::Either,
         }
     }
 }

@@ -12,7 +12,7 @@ use irradia_splat::{logit, sigmoid};
 use rayon::prelude::*;
 
 /// Opens the scenes that [`Operation::Merge`] names; an error is one line.
-pub type Open<'a> = &'a dyn Fn(&str) -> Result<GaussianCloud, String>;
+pub type OpenScene<'a> = &'a dyn Fn(&str) -> Result<GaussianCloud, String>;
 
 /// For edits that must not read other scenes.
 pub fn open_nothing(file: &str) -> Result<GaussianCloud, String> {
@@ -83,8 +83,8 @@ pub struct Applied {
 ///
 /// # Errors
 /// When the edit is invalid or not possible on this scene.
-pub fn apply(draft: &mut Draft, edit: &Edit, open: Open) -> Result<Applied, EditError> {
-    Ok(Plan::new(draft, edit, open)?.carry_out(draft))
+pub fn apply(draft: &mut Draft, edit: &Edit, open: OpenScene) -> Result<Applied, EditError> {
+    Ok(Plan::new(draft, edit, open)?.execute(draft))
 }
 
 /// Like [`apply`], for an edit whose steps are known to give `selection` on this scene: they are not evaluated again. Edits that show or
@@ -95,9 +95,9 @@ pub fn apply(draft: &mut Draft, edit: &Edit, open: Open) -> Result<Applied, Edit
 ///
 /// # Panics
 /// When `selection` is that of another number of splats.
-pub fn apply_to(draft: &mut Draft, edit: &Edit, selection: &Selection, open: Open) -> Result<Applied, EditError> {
+pub fn apply_to(draft: &mut Draft, edit: &Edit, selection: &Selection, open: OpenScene) -> Result<Applied, EditError> {
     assert_eq!(selection.len(), draft.len(), "a selection of the same scene");
-    Ok(Plan::with(draft, edit, Some(selection), open)?.carry_out(draft))
+    Ok(Plan::with_selection(draft, edit, Some(selection), open)?.execute(draft))
 }
 
 /// An edit that can no longer fail.
@@ -125,7 +125,7 @@ pub(crate) enum Change {
 
 impl Change {
     /// Whether the scene no longer matches its photographs after the change.
-    fn leaves_photographs_behind(&self) -> bool {
+    fn invalidates_photographs(&self) -> bool {
         matches!(
             self,
             Self::Transform(..) | Self::Recolor(..) | Self::Fade(..) | Self::Append(..)
@@ -134,18 +134,23 @@ impl Change {
 }
 
 impl Plan {
-    pub fn new(draft: &Draft, edit: &Edit, open: Open) -> Result<Self, EditError> {
-        Self::with(draft, edit, None, open)
+    pub fn new(draft: &Draft, edit: &Edit, open: OpenScene) -> Result<Self, EditError> {
+        Self::with_selection(draft, edit, None, open)
     }
 
     /// The plan of an edit whose steps give `known`, if that is known.
-    fn with(draft: &Draft, edit: &Edit, known: Option<&Selection>, open: Open) -> Result<Self, EditError> {
+    fn with_selection(
+        draft: &Draft,
+        edit: &Edit,
+        known: Option<&Selection>,
+        open: OpenScene,
+    ) -> Result<Self, EditError> {
         edit.check()?;
         let mut edit = edit.clone();
         let n = draft.len();
         let selection = match (&edit.op, &edit.select) {
-            (Operation::Show {}, steps) => among(draft, &draft.hidden, steps.as_deref())?,
-            (Operation::Unlock {}, steps) => among(draft, &draft.locked, steps.as_deref())?,
+            (Operation::Show {}, steps) => select_marked(draft, &draft.hidden, steps.as_deref())?,
+            (Operation::Unlock {}, steps) => select_marked(draft, &draft.locked, steps.as_deref())?,
             (_, Some(steps)) => known.map_or_else(|| select(draft, steps), |known| Ok(known.clone()))?,
             // Hidden and locked splats move with the whole scene.
             (
@@ -172,7 +177,7 @@ impl Plan {
                 if is_scene {
                     DVec3::ZERO
                 } else {
-                    center_of(draft, &selection)
+                    mean_position(draft, &selection)
                 }
             };
             DVec3::from(*about.get_or_insert_with(|| center().to_array()))
@@ -215,7 +220,7 @@ impl Plan {
                     *up = Some(found.up);
                     *point = point.or(found.point);
                 }
-                transformed(upright(up.unwrap_or_default(), *point, *axis), selection)
+                transformed(upright_transform(up.unwrap_or_default(), *point, *axis), selection)
             }
             Operation::SetLength { from, to, length } => {
                 let factor = *length / DVec3::from(*from).distance(DVec3::from(*to));
@@ -250,7 +255,7 @@ impl Plan {
             Operation::Opacity { factor } => Change::Fade(selection, *factor),
             Operation::Reduce { count } => {
                 // In the whole scene, locked splats stay and count.
-                let stay = if is_scene { locked_in_sight(draft) } else { 0 };
+                let stay = if is_scene { count_visible_locked(draft) } else { 0 };
                 Change::Remove(least_important(draft, selection, count.saturating_sub(stay)))
             }
             Operation::Hide {} => Change::Hide(selection, true),
@@ -275,13 +280,13 @@ impl Plan {
         })
     }
 
-    pub fn carry_out(self, draft: &mut Draft) -> Applied {
+    pub fn execute(self, draft: &mut Draft) -> Applied {
         let n = draft.len();
         let mut provenance = Provenance::identity(n);
         let (mut moved, mut split) = (None, None);
         let selected = self.selection.count();
         draft.last = self.selection;
-        if self.change.leaves_photographs_behind() {
+        if self.change.invalidates_photographs() {
             draft.photographs = None;
         }
         match self.change {
@@ -307,7 +312,7 @@ impl Plan {
             Change::Fade(selection, factor) => {
                 let rows = draft.cloud.opacity_logits.iter_mut().zip(selection.as_slice());
                 rows.filter(|(_, s)| **s)
-                    .for_each(|(value, _)| *value = faded(*value, factor));
+                    .for_each(|(value, _)| *value = scaled_opacity_logit(*value, factor));
                 provenance.changed = selection;
             }
             Change::Append(mut cloud, new) => {
@@ -340,12 +345,16 @@ impl Plan {
 }
 
 /// The splats that `steps` select among `marked`; all of those if there are no steps.
-fn among(draft: &Draft, marked: &Selection, steps: Option<&[crate::SelectStep]>) -> Result<Selection, EditError> {
+fn select_marked(
+    draft: &Draft,
+    marked: &Selection,
+    steps: Option<&[crate::SelectStep]>,
+) -> Result<Selection, EditError> {
     steps.map_or_else(|| Ok(marked.clone()), |steps| select_among(draft, steps, marked))
 }
 
 /// Number of locked splats that are not hidden.
-fn locked_in_sight(draft: &Draft) -> usize {
+fn count_visible_locked(draft: &Draft) -> usize {
     let mut locked = draft.locked.clone();
     locked.subtract(&draft.hidden);
     locked.count()
@@ -369,20 +378,20 @@ fn remove(draft: &mut Draft, selection: Selection) -> Provenance {
 }
 
 /// Mean position of the selected splats.
-fn center_of(draft: &Draft, selection: &Selection) -> DVec3 {
+fn mean_position(draft: &Draft, selection: &Selection) -> DVec3 {
     let indices = selection.indices();
     let sum: DVec3 = indices.iter().map(|i| draft.position(*i as usize)).sum();
     sum / indices.len().max(1) as f64
 }
 
 /// The logit of an opacity times `factor`.
-fn faded(opacity_logit: f32, factor: f64) -> f32 {
+fn scaled_opacity_logit(opacity_logit: f32, factor: f64) -> f32 {
     let opacity = f64::from(sigmoid(opacity_logit)) * factor;
     logit(opacity.clamp(1e-6, 0.9999) as f32)
 }
 
 /// The transform that turns `up` to the axis and moves the ground to height 0.
-fn upright(up: [f64; 3], ground: Option<[f64; 3]>, axis: UpAxis) -> Transform {
+fn upright_transform(up: [f64; 3], ground: Option<[f64; 3]>, axis: UpAxis) -> Transform {
     let to = match axis {
         UpAxis::PlusY => DVec3::Y,
         UpAxis::MinusY => DVec3::NEG_Y,

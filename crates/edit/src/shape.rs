@@ -6,9 +6,9 @@ use irradia_scene::{Camera, Intrinsics, Pose, Similarity};
 use serde::{Deserialize, Serialize};
 
 /// Maximum number of points of a polygon or a stroke.
-const MOST_POINTS: usize = 10_000;
+const MAX_POINTS: usize = 10_000;
 /// Largest coordinate or length.
-const FARTHEST: f64 = 1e12;
+const MAX_MAGNITUDE: f64 = 1e12;
 
 /// One step of a selection: a shape, and how it changes the current selection.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -238,11 +238,11 @@ impl Viewpoint {
     }
 
     fn check(&self, of: &str) -> Result<(), EditError> {
-        finite(&format!("{of} camera.position"), &self.position)?;
-        rotation(&format!("{of} camera.rotation"), &self.rotation)?;
-        finite(&format!("{of} camera.principal"), &self.principal)?;
+        check_finite(&format!("{of} camera.position"), &self.position)?;
+        check_rotation(&format!("{of} camera.rotation"), &self.rotation)?;
+        check_finite(&format!("{of} camera.principal"), &self.principal)?;
         for focal in self.focal {
-            positive(&format!("{of} camera.focal"), focal)?;
+            check_positive(&format!("{of} camera.focal"), focal)?;
         }
         if self.size.iter().any(|side| !(1..=16384).contains(side)) {
             return Err(EditError::value(
@@ -286,93 +286,93 @@ impl SelectStep {
                 size,
                 rotation: r,
             } => {
-                finite("box center", center)?;
+                check_finite("box center", center)?;
                 for edge in size {
-                    positive("box size", *edge)?;
+                    check_positive("box size", *edge)?;
                 }
-                rotation("box rotation", r)
+                check_rotation("box rotation", r)
             }
             Shape::Sphere { center, radius } => {
-                finite("sphere center", center)?;
-                positive("sphere radius", *radius)
+                check_finite("sphere center", center)?;
+                check_positive("sphere radius", *radius)
             }
             Shape::HalfSpace { point, normal } => {
-                finite("half-space point", point)?;
-                direction("half-space normal", normal)
+                check_finite("half-space point", point)?;
+                check_direction("half-space normal", normal)
             }
             Shape::Polygon { camera, points, .. } => {
                 camera.check("polygon")?;
-                points_are("polygon points", points, 3)
+                check_points("polygon points", points, 3)
             }
             Shape::Brush {
                 camera, points, radius, ..
             } => {
                 camera.check("brush")?;
-                points_are("brush points", points, 1)?;
-                positive("brush radius", *radius)
+                check_points("brush points", points, 1)?;
+                check_positive("brush radius", *radius)
             }
             Shape::Color { low, high } => {
-                finite("color low", low)?;
-                finite("color high", high)
+                check_finite("color low", low)?;
+                check_finite("color high", high)
             }
-            Shape::Opacity { min, max } => range("opacity", min.as_ref(), max.as_ref()),
-            Shape::Size { min, max } => range("size", min.as_ref(), max.as_ref()),
-            Shape::Elongation { min, max } => range("elongation", min.as_ref(), max.as_ref()),
-            Shape::Views { min, max } => range("views", min.as_ref(), max.as_ref()),
+            Shape::Opacity { min, max } => check_range("opacity", min.as_ref(), max.as_ref()),
+            Shape::Size { min, max } => check_range("size", min.as_ref(), max.as_ref()),
+            Shape::Elongation { min, max } => check_range("elongation", min.as_ref(), max.as_ref()),
+            Shape::Views { min, max } => check_range("views", min.as_ref(), max.as_ref()),
             Shape::Clusters { min, max, gap } => {
-                range("clusters", min.as_ref(), max.as_ref())?;
-                gap.map_or(Ok(()), |gap| positive("clusters gap", gap))
+                check_range("clusters", min.as_ref(), max.as_ref())?;
+                gap.map_or(Ok(()), |gap| check_positive("clusters gap", gap))
             }
-            Shape::Floaters { score } => score.map_or(Ok(()), |score| positive("floaters score", score)),
-            Shape::Subject { margin } => margin.map_or(Ok(()), |margin| positive("subject margin", margin)),
-            Shape::Grow { by } => positive("grow by", *by),
-            Shape::Connected { gap } => gap.map_or(Ok(()), |gap| positive("connected gap", gap)),
+            Shape::Floaters { score } => score.map_or(Ok(()), |score| check_positive("floaters score", score)),
+            Shape::Subject { margin } => margin.map_or(Ok(()), |margin| check_positive("subject margin", margin)),
+            Shape::Grow { by } => check_positive("grow by", *by),
+            Shape::Connected { gap } => gap.map_or(Ok(()), |gap| check_positive("connected gap", gap)),
         }
     }
 }
 
 /// Checks that all values are numbers of a sensible magnitude.
-pub(crate) fn finite(name: &str, values: &[f64]) -> Result<(), EditError> {
-    match values.iter().all(|v| v.abs() <= FARTHEST) {
+pub(crate) fn check_finite(name: &str, values: &[f64]) -> Result<(), EditError> {
+    match values.iter().all(|v| v.abs() <= MAX_MAGNITUDE) {
         true => Ok(()),
         false => Err(EditError::value(name, "must be numbers between -1e12 and 1e12")),
     }
 }
 
 /// Checks that a value is a positive number of a sensible magnitude.
-pub(crate) fn positive(name: &str, value: f64) -> Result<(), EditError> {
-    match value > 1e-12 && value <= FARTHEST {
+pub(crate) fn check_positive(name: &str, value: f64) -> Result<(), EditError> {
+    match value > 1e-12 && value <= MAX_MAGNITUDE {
         true => Ok(()),
         false => Err(EditError::value(name, "must be a number above 0 and at most 1e12")),
     }
 }
 
 /// Checks that a vector has a direction.
-pub(crate) fn direction(name: &str, vector: &[f64; 3]) -> Result<(), EditError> {
-    finite(name, vector)?;
+pub(crate) fn check_direction(name: &str, vector: &[f64; 3]) -> Result<(), EditError> {
+    check_finite(name, vector)?;
     match DVec3::from(*vector).length() > 1e-9 {
         true => Ok(()),
         false => Err(EditError::value(name, "must not be of length zero")),
     }
 }
 
-fn rotation(name: &str, values: &[f64; 4]) -> Result<(), EditError> {
-    finite(name, values)?;
+fn check_rotation(name: &str, values: &[f64; 4]) -> Result<(), EditError> {
+    check_finite(name, values)?;
     match values.iter().map(|v| v * v).sum::<f64>() > 1e-18 {
         true => Ok(()),
         false => Err(EditError::value(name, "must not be the zero quaternion")),
     }
 }
 
-fn points_are(name: &str, points: &[[f64; 2]], least: usize) -> Result<(), EditError> {
-    if !(least..=MOST_POINTS).contains(&points.len()) {
-        let message = format!("has {} points, must have {least} to {MOST_POINTS}", points.len());
+fn check_points(name: &str, points: &[[f64; 2]], min_points: usize) -> Result<(), EditError> {
+    if !(min_points..=MAX_POINTS).contains(&points.len()) {
+        let message = format!("has {} points, must have {min_points} to {MAX_POINTS}", points.len());
         return Err(EditError::value(name, message));
     }
-    finite(name, points.as_flattened())
+    check_finite(name, points.as_flattened())
 }
 
-fn range<T: PartialOrd>(name: &str, min: Option<&T>, max: Option<&T>) -> Result<(), EditError> {
+fn check_range<T: PartialOrd>(name: &str, min: Option<&T>, max: Option<&T>) -> Result<(), EditError> {
     // NaN does not compare even to itself.
     let is_number = |bound: Option<&T>| bound.is_none_or(|bound| bound.partial_cmp(bound).is_some());
     if !is_number(min) || !is_number(max) {

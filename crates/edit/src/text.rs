@@ -21,13 +21,13 @@ impl FromStr for Edit {
     type Err = EditError;
 
     fn from_str(text: &str) -> Result<Self, EditError> {
-        let words = words(text)?;
+        let words = split_words(text)?;
         let mut words = words.iter().map(String::as_str);
         let op = words.next().ok_or_else(|| {
-            EditError::Words("an empty edit: name an operation, such as: delete sphere center=0,0,0 radius=1".into())
+            EditError::Syntax("an empty edit: name an operation, such as: delete sphere center=0,0,0 radius=1".into())
         })?;
         if op.contains('=') {
-            return Err(EditError::Words(format!(
+            return Err(EditError::Syntax(format!(
                 "{op}: an edit begins with its operation, such as delete"
             )));
         }
@@ -37,8 +37,8 @@ impl FromStr for Edit {
             match word.split_once('=') {
                 Some((key, text)) => {
                     let table = steps.last_mut().unwrap_or(&mut edit);
-                    insert(table, key, value(text))
-                        .map_err(|why| EditError::Words(format!("{word}: {why}; a key is written KEY=VALUE")))?;
+                    insert(table, key, parse_value(text))
+                        .map_err(|why| EditError::Syntax(format!("{word}: {why}; a key is written KEY=VALUE")))?;
                 }
                 None => {
                     let (mode, shape) = match word.split_at_checked(1) {
@@ -61,7 +61,7 @@ impl FromStr for Edit {
 }
 
 /// Splits `text` into words, which keep their quotes.
-fn words(text: &str) -> Result<Vec<String>, EditError> {
+fn split_words(text: &str) -> Result<Vec<String>, EditError> {
     let (mut words, mut word, mut quoted) = (Vec::new(), String::new(), false);
     for c in text.chars() {
         quoted ^= c == QUOTE;
@@ -71,7 +71,7 @@ fn words(text: &str) -> Result<Vec<String>, EditError> {
         }
     }
     if quoted {
-        return Err(EditError::Words(format!("{word}: a quote is not closed")));
+        return Err(EditError::Syntax(format!("{word}: a quote is not closed")));
     }
     words.push(word);
     words.retain(|word| !word.is_empty());
@@ -95,7 +95,7 @@ fn insert(table: &mut Table, key: &str, value: Value) -> Result<(), &'static str
 }
 
 /// Parses a number, a vector, a list of vectors or a Boolean; anything else, and anything in quotes, is a word.
-fn value(text: &str) -> Value {
+fn parse_value(text: &str) -> Value {
     if text.contains(QUOTE) {
         return text.replace(QUOTE, "").into();
     }
@@ -149,24 +149,24 @@ fn write_keys(f: &mut fmt::Formatter, prefix: &str, table: &Table) -> fmt::Resul
         match value {
             Value::Table(inner) => write_keys(f, &format!("{prefix}{key}."), inner)?,
             Value::Array(items) if items.iter().any(Value::is_array) => {
-                let vectors: Vec<String> = items.iter().map(in_words).collect();
+                let vectors: Vec<String> = items.iter().map(format_value).collect();
                 let end = if vectors.len() == 1 { ";" } else { "" };
                 write!(f, " {prefix}{key}={}{end}", vectors.join(";"))?;
             }
-            value => write!(f, " {prefix}{key}={}", in_words(value))?,
+            value => write!(f, " {prefix}{key}={}", format_value(value))?,
         }
     }
     Ok(())
 }
 
-fn in_words(value: &Value) -> String {
+fn format_value(value: &Value) -> String {
     match value {
-        Value::String(text) if text.contains(char::is_whitespace) || !self::value(text).is_str() => {
+        Value::String(text) if text.contains(char::is_whitespace) || !self::parse_value(text).is_str() => {
             format!("{QUOTE}{text}{QUOTE}")
         }
         Value::String(text) => text.clone(),
         Value::Float(number) => number.to_string(),
-        Value::Array(items) => items.iter().map(in_words).collect::<Vec<_>>().join(","),
+        Value::Array(items) => items.iter().map(format_value).collect::<Vec<_>>().join(","),
         other => other.to_string(),
     }
 }

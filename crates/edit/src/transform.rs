@@ -82,11 +82,11 @@ pub(crate) fn transform_splats(cloud: &mut GaussianCloud, selection: &Selection,
     let selected = selection.as_slice();
     let means = cloud.means.par_iter_mut().zip(selected).with_min_len(1024);
     means.filter(|(_, s)| **s).for_each(|(mean, _)| *mean = moved(*mean));
-    turn_and_scale(cloud, Some(selected), transform);
+    rotate_and_scale(cloud, Some(selected), transform);
 }
 
 /// Rotates the quaternions and harmonics of the selected splats and scales their sizes; those of all splats if `selected` is `None`.
-fn turn_and_scale(cloud: &mut GaussianCloud, selected: Option<&[bool]>, transform: &Transform) {
+fn rotate_and_scale(cloud: &mut GaussianCloud, selected: Option<&[bool]>, transform: &Transform) {
     let is_in = |i: usize| selected.is_none_or(|selected| selected[i]);
     if transform.scale != 1.0 {
         let by = transform.scale.ln();
@@ -133,7 +133,7 @@ pub(crate) fn transform_scene(draft: &mut Draft, transform: &Transform) {
             scale: 1.0,
             ..*transform
         };
-        turn_and_scale(&mut draft.cloud, None, &in_world);
+        rotate_and_scale(&mut draft.cloud, None, &in_world);
         let turn = turn.as_quat();
         for camera in &mut draft.cameras {
             camera.pose.position = turn * camera.pose.position;
@@ -141,7 +141,7 @@ pub(crate) fn transform_scene(draft: &mut Draft, transform: &Transform) {
         }
     }
     draft.cloud.world_from_dataset = world;
-    if old.is_identity() && is_ordinary(&draft.cloud) {
+    if old.is_identity() && fits_dataset_coordinates(&draft.cloud) {
         for camera in &mut draft.cameras {
             camera.pose.position = world.invert(camera.pose.position.as_dvec3()).as_vec3();
         }
@@ -150,7 +150,7 @@ pub(crate) fn transform_scene(draft: &mut Draft, transform: &Transform) {
 }
 
 /// Whether the dataset's own coordinates can serve as the world: the scene has an ordinary size and is not far from the origin.
-fn is_ordinary(cloud: &GaussianCloud) -> bool {
+fn fits_dataset_coordinates(cloud: &GaussianCloud) -> bool {
     let world = cloud.world_from_dataset;
     let n = cloud.len().max(1);
     let mean = |i: usize| DVec3::from(cloud.means[i].map(f64::from));

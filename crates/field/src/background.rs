@@ -16,7 +16,7 @@ use irradia_compute::simd::{Double, Lanes, Scalar, Simd};
 pub(crate) const MAX_DEGREE: u32 = 3;
 
 /// Number of coefficients of a background of `degree`, 0 for none.
-pub(crate) fn numbers(degree: Option<u32>) -> usize {
+pub(crate) fn coefficient_count(degree: Option<u32>) -> usize {
     degree.map_or(0, |degree| 3 * (degree as usize + 1).pow(2))
 }
 

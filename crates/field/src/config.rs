@@ -1,7 +1,7 @@
 //! The configuration of a field.
 
 use crate::FieldError;
-use crate::background::{MAX_DEGREE, numbers};
+use crate::background::{MAX_DEGREE, coefficient_count};
 use crate::encoding::{DirectionEncoding, Frequency, HashGrid, PositionEncoding};
 use crate::net::{Activation, ColorShape, Net, NetShape};
 use crate::sample::march::Steps;
@@ -64,7 +64,7 @@ pub struct FieldConfig {
 }
 
 /// Maximum number of samples per ray and round.
-const MOST_SAMPLES: usize = 1 << 16;
+const MAX_SAMPLES: usize = 1 << 16;
 
 impl FieldConfig {
     /// Instant-NGP at sizes suited to CPUs: 8 levels of 4 features in tables of 2^15 corners, hidden layers of 32.
@@ -154,13 +154,16 @@ impl FieldConfig {
     }
 
     /// Number of values in [`crate::Field::tensors`]: the trained parameters and the occupancy grid.
-    pub fn numbers(&self) -> usize {
+    pub fn value_count(&self) -> usize {
         let nets = self.nets().into_iter().map(|shape| Net::new(shape).sizes());
         let grid = match &self.sampler {
             Sampler::Occupancy(o) => o.side.pow(3),
             _ => 0,
         };
-        nets.flatten().sum::<usize>() + self.images * self.appearance() + numbers(self.background_degree) + grid
+        nets.flatten().sum::<usize>()
+            + self.images * self.appearance()
+            + coefficient_count(self.background_degree)
+            + grid
     }
 
     /// Checks that all sizes are within bounds.
@@ -197,8 +200,8 @@ impl FieldConfig {
             return wrong("number of images", self.images.to_string(), "must be at most 2^24");
         }
         for net in self.nets() {
-            for (what, value, most, hint) in limits(&net) {
-                if value > most {
+            for (what, value, limit, hint) in limits(&net) {
+                if value > limit {
                     return wrong(what, value.to_string(), hint);
                 }
             }
@@ -262,14 +265,14 @@ impl FieldConfig {
                 }
             }
             Sampler::Hierarchy { coarse, fine } => {
-                if !(2..=MOST_SAMPLES).contains(coarse) || !(1..=MOST_SAMPLES).contains(fine) {
+                if !(2..=MAX_SAMPLES).contains(coarse) || !(1..=MAX_SAMPLES).contains(fine) {
                     let value = format!("{coarse} + {fine}");
                     return wrong("samples", value, "must be at least 2 and 1, and at most 65536");
                 }
             }
             Sampler::Proposal { rounds, last } => {
                 let mut counts = rounds.iter().map(|(_, n)| n).chain([last]);
-                if rounds.is_empty() || counts.any(|n| !(2..=MOST_SAMPLES).contains(n)) {
+                if rounds.is_empty() || counts.any(|n| !(2..=MAX_SAMPLES).contains(n)) {
                     return wrong(
                         "samples of a round",
                         last.to_string(),

@@ -92,13 +92,13 @@ fn on_gpu(
     options: &StepOptions,
 ) -> StepLoss {
     use crate::query::update_occupancy_by;
-    use crate::train::{EMPTY_ONE_IN, draw, set_rays, updates_occupancy};
+    use crate::train::{EMPTY_CELL_DIVISOR, draw, set_rays, updates_occupancy};
 
     let batch = draw(state, views, options);
     let loss = training.step(state, &batch, options);
     state.scratch.batch = batch;
     if updates_occupancy(&loss, options) {
-        update_occupancy_by(state, false, EMPTY_ONE_IN, options.seed, |field, points| {
+        update_occupancy_by(state, false, EMPTY_CELL_DIVISOR, options.seed, |field, points| {
             training.densities(field, points)
         });
         training.upload_occupancy(&state.field);

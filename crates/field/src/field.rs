@@ -1,6 +1,6 @@
 //! A radiance field and its parameters.
 
-use crate::background::{background_color, numbers};
+use crate::background::{background_color, coefficient_count};
 use crate::config::{FieldConfig, Sampler};
 use crate::net::{Net, NetParameters, NetShape};
 use crate::sample::OccupancyGrid;
@@ -9,7 +9,7 @@ use crate::tensors::{Tensors, fill, fill_one, named};
 use irradia_scene::Rng;
 
 /// Standard deviation of the first appearance codes of a residual field.
-const FIRST_CODE: f32 = 0.1;
+const CODE_DEVIATION: f32 = 0.1;
 
 /// An invalid [`FieldConfig`] or list of tensors.
 #[derive(Debug, thiserror::Error)]
@@ -73,7 +73,7 @@ impl Field {
             Sampler::Occupancy(o) => Some(OccupancyGrid::new(o.side)),
             _ => None,
         };
-        let background = vec![0.0; numbers(config.background_degree)];
+        let background = vec![0.0; coefficient_count(config.background_degree)];
         Ok(Self {
             config,
             space,
@@ -94,7 +94,7 @@ impl Field {
         let mut field = Self::new(FieldConfig::residual(net, mirrored, images), space, seed)?;
         field.nets[0].zero_color(&mut field.parameters[0]);
         let mut rng = Rng::new(seed, 0xc0de);
-        field.codes.fill_with(|| FIRST_CODE * rng.normal());
+        field.codes.fill_with(|| CODE_DEVIATION * rng.normal());
         Ok(field)
     }
 

@@ -7,7 +7,7 @@ use crate::Rows;
 use crate::config::Sampler;
 use crate::field::Field;
 use crate::mlp::PANEL;
-use crate::net::{Block, Net, NetParameters, get3, place, set3};
+use crate::net::{Block, Net, NetParameters, get3, sample_offset, set3};
 use crate::render::quadrature::weights;
 use crate::sample::importance::importance;
 use crate::sample::march::March;
@@ -19,9 +19,9 @@ use irradia_compute::simd::{Kernel, Lanes, Simd};
 use irradia_scene::Rng;
 
 /// Number of samples that fills a chunk: 16 panels, whose activations fit the L2 cache.
-const CHUNK: usize = 512;
+const CHUNK_SAMPLES: usize = 512;
 /// Number of rays marched together through an occupancy grid: at the start of a chunk, and at most.
-const TOGETHER: [usize; 2] = [4, 16];
+const MARCHED_RAYS: [usize; 2] = [4, 16];
 
 /// One network's samples along a chunk of rays.
 #[derive(Clone, Debug, Default)]
@@ -36,7 +36,7 @@ pub(crate) struct Pass {
     pub edges: Vec<f32>,
     pub block: Block<f32>,
     /// Transmittance of each interval, `exp(-sigma_i delta_i)`.
-    pub through: Vec<f32>,
+    pub interval_transmittances: Vec<f32>,
     pub weights: Vec<f32>,
     /// Transmittance of each whole ray.
     pub transmittance: Vec<f32>,
@@ -108,14 +108,17 @@ impl Pass {
             net: &field.nets[net],
             parameters: &field.parameters[net],
             lengths: &self.lengths,
-            through: &mut self.through,
+            interval_transmittances: &mut self.interval_transmittances,
             block: &mut self.block,
         });
         self.weights.resize(n, 0.0);
         self.kept.clear();
         for r in 0..rays.len() {
             let range = self.of(r);
-            let (counted, transmittance) = weights(&self.through[range.clone()], &mut self.weights[range.clone()]);
+            let (counted, transmittance) = weights(
+                &self.interval_transmittances[range.clone()],
+                &mut self.weights[range.clone()],
+            );
             self.transmittance.push(transmittance);
             self.kept.extend((range.start..range.start + counted).map(|i| i as u32));
         }
@@ -133,7 +136,7 @@ impl Pass {
             for (to, from) in self.kept.iter().map(|k| *k as usize).enumerate() {
                 self.middles[to] = self.middles[from];
                 self.lengths[to] = self.lengths[from];
-                self.through[to] = self.through[from];
+                self.interval_transmittances[to] = self.interval_transmittances[from];
                 self.weights[to] = self.weights[from];
             }
             for list in [&mut self.middles, &mut self.lengths, &mut self.weights] {
@@ -159,7 +162,7 @@ impl Pass {
             for i in self.starts[r]..self.starts[r + 1] {
                 set3(&mut self.block.directions, i, ray.view);
                 for (k, value) in code.iter().enumerate() {
-                    self.block.codes[place(size, i) + k * PANEL] = *value;
+                    self.block.codes[sample_offset(size, i) + k * PANEL] = *value;
                 }
             }
         }
@@ -207,13 +210,13 @@ pub(crate) fn trace(
                 grid,
                 steps: options.steps,
             };
-            while taken < rays.len() && pass.middles.len() < CHUNK {
+            while taken < rays.len() && pass.middles.len() < CHUNK_SAMPLES {
                 // As many rays as should fill the chunk, judging by those already in it.
-                let missing = (CHUNK - pass.middles.len()) * taken / pass.middles.len().max(1);
+                let missing = (CHUNK_SAMPLES - pass.middles.len()) * taken / pass.middles.len().max(1);
                 let count = if taken == 0 {
-                    TOGETHER[0]
+                    MARCHED_RAYS[0]
                 } else {
-                    missing.clamp(1, TOGETHER[1])
+                    missing.clamp(1, MARCHED_RAYS[1])
                 };
                 let group = &rays[taken..rays.len().min(taken + count)];
                 let offset = || rng.as_mut().map_or(0.5, |rng| rng.uniform());
@@ -242,8 +245,8 @@ pub(crate) fn trace(
             rounds.chain([(*last, false)]).collect()
         }
     };
-    let most = rounds.iter().map(|(n, _)| *n).max().unwrap_or(1);
-    let taken = rays.len().min((CHUNK / most).max(1));
+    let max_samples = rounds.iter().map(|(n, _)| *n).max().unwrap_or(1);
+    let taken = rays.len().min((CHUNK_SAMPLES / max_samples).max(1));
     let rays = &rays[..taken];
     let mut edges = Vec::new();
     let mut before = 0;
@@ -295,7 +298,7 @@ pub(crate) struct Densities<'a> {
     pub net: &'a Net,
     pub parameters: &'a NetParameters<f32>,
     pub lengths: &'a [f32],
-    pub through: &'a mut Vec<f32>,
+    pub interval_transmittances: &'a mut Vec<f32>,
     pub block: &'a mut Block<f32>,
 }
 
@@ -308,10 +311,10 @@ impl Kernel for Densities<'_> {
         S::F: Lanes<Scalar = f32>,
     {
         self.net.density(simd, self.parameters, self.block);
-        self.through.resize(self.lengths.len(), 0.0);
+        self.interval_transmittances.resize(self.lengths.len(), 0.0);
         for s in (0..self.lengths.len()).step_by(S::LANES) {
             let optical_depth = simd.load(&self.block.density[s..]) * simd.load(&self.lengths[s..]);
-            (-optical_depth).exp().store(&mut self.through[s..]);
+            (-optical_depth).exp().store(&mut self.interval_transmittances[s..]);
         }
     }
 }

@@ -13,7 +13,7 @@ use irradia_scene::Rng;
 use rayon::prelude::*;
 
 /// Points per task.
-const CHUNK: usize = 1024;
+const POINTS_PER_TASK: usize = 1024;
 
 /// Updates cells of the occupancy grid: all of them, or the occupied ones and a random fraction `1 / one_in` of the others.
 /// Does nothing for other samplers.
@@ -113,8 +113,8 @@ fn query<T: Send>(
 ) {
     let level = Level::detect();
     let last = field.nets.len() - 1;
-    to.par_chunks_mut(CHUNK)
-        .zip(points.par_chunks(CHUNK))
+    to.par_chunks_mut(POINTS_PER_TASK)
+        .zip(points.par_chunks(POINTS_PER_TASK))
         .enumerate()
         .for_each_init(Block::default, |block, (chunk, (to, points))| {
             block.reset(points.len());
@@ -126,6 +126,6 @@ fn query<T: Send>(
                 parameters: &field.parameters[last],
                 block,
             });
-            read(block, chunk * CHUNK, to);
+            read(block, chunk * POINTS_PER_TASK, to);
         });
 }

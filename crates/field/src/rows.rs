@@ -3,7 +3,7 @@
 use std::ops::{Deref, DerefMut};
 
 /// Bytes per cache line, and per widest vector.
-const LINE: usize = 64;
+const CACHE_LINE: usize = 64;
 
 /// A list aligned to a cache line, so that no vector of a panel's row spans two lines: with 64-byte vectors every load from an
 /// unaligned list does, and costs twice. Shrinking keeps the memory. A clone has the same values, not necessarily aligned.
@@ -22,11 +22,11 @@ impl<T: Copy + Default> Rows<T> {
 
     /// Resizes to `len` values, filling new ones with `value`.
     pub fn resize(&mut self, len: usize, value: T) {
-        let spare = LINE / size_of::<T>();
+        let spare = CACHE_LINE / size_of::<T>();
         if self.start + len > self.data.len() {
             let mut data = vec![value; len + len / 2 + spare];
             // `align_offset` may decline to answer; any offset is then correct.
-            let start = data.as_ptr().align_offset(LINE).min(spare);
+            let start = data.as_ptr().align_offset(CACHE_LINE).min(spare);
             data[start..start + self.len].copy_from_slice(self);
             (self.data, self.start) = (data, start);
         }
@@ -84,7 +84,7 @@ mod tests {
             rows.clear();
             rows.resize(len, 1.5f32);
             assert_eq!((rows.len(), rows.iter().sum::<f32>()), (len, 1.5 * len as f32));
-            assert_eq!(rows.as_ptr() as usize % LINE, 0);
+            assert_eq!(rows.as_ptr() as usize % CACHE_LINE, 0);
         }
         rows.truncate(2);
         rows.extend_from_slice(&[7.0]);

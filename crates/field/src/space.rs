@@ -79,7 +79,7 @@ pub enum Measure {
 }
 
 /// Length of contracted rays, field units: beyond it, points move by less than a cell of any grid.
-const FAR: f32 = 200.0;
+const MAX_RAY_LENGTH: f32 = 200.0;
 
 impl Space {
     /// The cube about `center` with half size `half`, world units, and nothing outside.
@@ -190,7 +190,7 @@ impl Space {
                     (ray.near, ray.far) = (near, far);
                 }
             }
-            Outside::Contracted => (ray.near, ray.far) = (0.0, FAR),
+            Outside::Contracted => (ray.near, ray.far) = (0.0, MAX_RAY_LENGTH),
             Outside::Ndc(frustum) => {
                 if let Some((from, along, [start, near])) = frustum.line(origin, view) {
                     let length = along.iter().map(|v| v * v).sum::<f32>().sqrt();

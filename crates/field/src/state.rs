@@ -35,7 +35,7 @@ impl FieldState {
             code_moments: no_moments(&field.codes),
             background_moments: no_moments(&field.background),
             step: 0,
-            rays: FIRST_RAYS,
+            rays: INITIAL_RAYS,
             scratch: crate::train::Scratch::default(),
             field,
         }
@@ -45,7 +45,7 @@ impl FieldState {
     /// numbers depend only on the seed and the step.
     pub fn tensors(&self) -> Tensors<'_> {
         let mut list = self.field.tensors();
-        for (k, prefix) in PREFIXES.into_iter().enumerate() {
+        for (k, prefix) in MOMENT_PREFIXES.into_iter().enumerate() {
             let lists = [&self.code_moments[k][..], &self.background_moments[k]];
             list.extend(named(prefix, &self.moments[k], lists));
         }
@@ -64,7 +64,7 @@ impl FieldState {
         mut get: impl FnMut(&str) -> Option<Vec<f32>>,
     ) -> Result<Self, FieldError> {
         let mut state = Self::new(Field::from_tensors(config, space, &mut get)?);
-        for (k, prefix) in PREFIXES.into_iter().enumerate() {
+        for (k, prefix) in MOMENT_PREFIXES.into_iter().enumerate() {
             let lists = [&mut state.code_moments[k][..], &mut state.background_moments[k]];
             fill(prefix, &mut state.moments[k], lists, &mut get)?;
         }
@@ -74,6 +74,6 @@ impl FieldState {
 }
 
 /// An untrained field is dense everywhere, so that few rays yield many samples.
-const FIRST_RAYS: usize = 128;
+const INITIAL_RAYS: usize = 128;
 
-const PREFIXES: [&str; 2] = ["first.", "second."];
+const MOMENT_PREFIXES: [&str; 2] = ["first.", "second."];

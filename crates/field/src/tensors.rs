@@ -7,9 +7,9 @@ use crate::net::NetParameters;
 pub type Tensors<'a> = Vec<(String, Vec<usize>, &'a [f32])>;
 
 /// Names of the parameter lists that are not part of a network.
-const LISTS: [&str; 2] = ["codes", "background"];
+const LIST_NAMES: [&str; 2] = ["codes", "background"];
 
-/// All tensors that are not empty, with `prefix` before their names; `lists` are in the order of [`LISTS`].
+/// All tensors that are not empty, with `prefix` before their names; `lists` are in the order of [`LIST_NAMES`].
 pub(crate) fn named<'a>(prefix: &str, nets: &'a [NetParameters<f32>], lists: [&'a [f32]; 2]) -> Tensors<'a> {
     let mut list = Vec::new();
     for (i, net) in nets.iter().enumerate() {
@@ -19,7 +19,7 @@ pub(crate) fn named<'a>(prefix: &str, nets: &'a [NetParameters<f32>], lists: [&'
             }
         }
     }
-    for (name, values) in LISTS.into_iter().zip(lists) {
+    for (name, values) in LIST_NAMES.into_iter().zip(lists) {
         if !values.is_empty() {
             list.push((format!("{prefix}{name}"), vec![values.len()], values));
         }
@@ -43,7 +43,7 @@ pub(crate) fn fill(
             fill_one(&format!("{prefix}net{i}.{part}"), values, get)?;
         }
     }
-    for (name, values) in LISTS.into_iter().zip(lists) {
+    for (name, values) in LIST_NAMES.into_iter().zip(lists) {
         fill_one(&format!("{prefix}{name}"), values, get)?;
     }
     Ok(())

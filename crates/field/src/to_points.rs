@@ -45,11 +45,11 @@ pub struct FieldPoints {
 /// Hits per point requested: a surface's cells are then hit more than once on average.
 const HITS_PER_POINT: usize = 2;
 /// Maximum number of rounds, each with as many rays as hits are needed: much of each image may be empty.
-const ROUNDS: u64 = 16;
+const MAX_ROUNDS: u64 = 16;
 /// Rays per task.
-const CHUNK: usize = 1024;
+const RAYS_PER_TASK: usize = 1024;
 /// The finest grid for thinning, cells per side of the unit cube.
-const FINEST: u32 = 4096;
+const MAX_SIDE: u32 = 4096;
 
 /// Where one ray hit a surface.
 #[derive(Clone, Copy)]
@@ -67,9 +67,9 @@ pub fn to_points(field: &Field, cameras: &[Camera], options: &PointsOptions) -> 
         return FieldPoints::default();
     }
     let wanted = HITS_PER_POINT * options.count;
-    let chunks = wanted.div_ceil(CHUNK) as u64;
+    let chunks = wanted.div_ceil(RAYS_PER_TASK) as u64;
     let mut hits: Vec<Hit> = Vec::new();
-    for round in 0..ROUNDS {
+    for round in 0..MAX_ROUNDS {
         let traced: Vec<Vec<Hit>> = (round * chunks..(round + 1) * chunks)
             .into_par_iter()
             .map_init(Vec::new, |passes, chunk| {
@@ -81,7 +81,7 @@ pub fn to_points(field: &Field, cameras: &[Camera], options: &PointsOptions) -> 
             break;
         }
     }
-    let (mut low, mut high) = (1, FINEST);
+    let (mut low, mut high) = (1, MAX_SIDE);
     while low < high {
         let side = (low + high).div_ceil(2);
         let mut cells: Vec<u64> = hits.iter().map(|hit| cell(hit.unit, side)).collect();
@@ -104,7 +104,7 @@ fn trace_hits(
     passes: &mut Vec<Pass>,
 ) -> Vec<Hit> {
     let mut rng = Rng::new(options.seed, chunk);
-    let rays: Vec<_> = (0..CHUNK)
+    let rays: Vec<_> = (0..RAYS_PER_TASK)
         .map(|_| {
             let camera = &cameras[rng.below(cameras.len() as u32) as usize];
             let (w, h) = (camera.intrinsics.width as f32, camera.intrinsics.height as f32);

@@ -14,7 +14,7 @@ use crate::space::Ray;
 use irradia_compute::Level;
 
 /// Samples of a ray between two density evaluations.
-const STRETCH: usize = PANEL;
+const STRETCH_SAMPLES: usize = PANEL;
 
 /// The progress of one ray.
 #[derive(Clone, Debug, Default)]
@@ -38,7 +38,7 @@ pub(crate) struct Walks {
     active: Vec<usize>,
     block: Block<f32>,
     lengths: Vec<f32>,
-    through: Vec<f32>,
+    interval_transmittances: Vec<f32>,
 }
 
 impl Walks {
@@ -65,7 +65,7 @@ impl Walks {
             let walks = &mut self.walks;
             self.active.retain(|r| {
                 let (walk, ray) = (&mut walks[*r], &rays[*r]);
-                walk.next = march.advance(ray, walk.next, STRETCH, &mut walk.middles, &mut walk.lengths);
+                walk.next = march.advance(ray, walk.next, STRETCH_SAMPLES, &mut walk.middles, &mut walk.lengths);
                 walk.next < ray.far
             });
             if self.active.is_empty() {
@@ -77,7 +77,7 @@ impl Walks {
 
     /// Evaluates the last stretch of the active rays, and ends those that have become opaque.
     fn evaluate(&mut self, level: Level, field: &Field, rays: &[Ray]) {
-        self.block.reset(self.active.len() * STRETCH);
+        self.block.reset(self.active.len() * STRETCH_SAMPLES);
         self.lengths.clear();
         for r in &self.active {
             let walk = &self.walks[*r];
@@ -91,10 +91,13 @@ impl Walks {
             net: &field.nets[0],
             parameters: &field.parameters[0],
             lengths: &self.lengths,
-            through: &mut self.through,
+            interval_transmittances: &mut self.interval_transmittances,
             block: &mut self.block,
         });
-        let (walks, mut at) = (&mut self.walks, self.through.chunks_exact(STRETCH));
+        let (walks, mut at) = (
+            &mut self.walks,
+            self.interval_transmittances.chunks_exact(STRETCH_SAMPLES),
+        );
         self.active.retain(|r| {
             let walk = &mut walks[*r];
             let stretch = at.next().expect("a stretch per ray");
@@ -155,7 +158,7 @@ mod tests {
                     cut += 1;
                     assert!(optical_depth(n) > end - 1e-3, "cut at {}", optical_depth(n));
                     assert!(
-                        n < STRETCH || optical_depth(n - STRETCH) < end,
+                        n < STRETCH_SAMPLES || optical_depth(n - STRETCH_SAMPLES) < end,
                         "cut late at {}",
                         optical_depth(n)
                     );

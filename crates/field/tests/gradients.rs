@@ -6,19 +6,19 @@ use irradia_field::contraction::{contract, contract_vjp, uncontract};
 use irradia_field::encoding::direction::{harmonics, harmonics_vjp};
 use irradia_field::encoding::{DirectionEncoding, Frequency, HashGrid, PositionEncoding};
 use irradia_field::mlp::{Mlp, MlpShape, MlpTape, PANEL};
-use irradia_field::net::{Activation, Block, ColorShape, Net, NetParameters, NetShape, get3, place, set3};
+use irradia_field::net::{Activation, Block, ColorShape, Net, NetParameters, NetShape, get3, sample_offset, set3};
 use irradia_field::render::quadrature::{weights, weights_vjp};
 use irradia_field::sample::proposal::{distortion, interlevel};
 use irradia_field::{Rows, background_color, background_vjp};
 use irradia_scene::Rng;
-use irradia_testkit::differences::Differences;
+use irradia_testkit::finite_differences::FiniteDifferences;
 
 /// Step of the differences; truncation error is its square, 1e-10, and rounding error 1e-16 / 1e-5.
 const H: f64 = 1e-5;
 
 /// Compares `gradient` with central differences of `f` at `x`, in the components `which`.
 fn check(what: &str, x: &[f64], gradient: &[f64], which: impl Iterator<Item = usize>, f: impl Fn(&[f64]) -> f64) {
-    Differences::of_largest(H, 1e-6).check(what, x, gradient, which, f);
+    FiniteDifferences::relative_to_max(H, 1e-6).check(what, x, gradient, which, f);
 }
 
 fn random(rng: &mut Rng, n: usize, low: f32, high: f32) -> Vec<f64> {
@@ -370,7 +370,7 @@ fn a_dense_grid_level_interpolates_linearly() {
     let rows = net.encoded_rows();
     for (i, point) in points.iter().enumerate() {
         for c in 0..3 {
-            let got = block.encoded[place(rows, i) + c * PANEL];
+            let got = block.encoded[sample_offset(rows, i) + c * PANEL];
             // Corners are stored in single precision.
             assert!((got - point[c]).abs() < 1e-7, "{got}, expected {}", point[c]);
         }
@@ -383,14 +383,14 @@ fn compositing_gradients_match_finite_differences() {
     let optical_depths = random(&mut rng, 12, 0.0, 0.6);
     let v = random(&mut rng, 12, -1.0, 1.0);
     let forward = |optical_depths: &[f64]| {
-        let through: Vec<f64> = optical_depths.iter().map(|t| (-t).exp()).collect();
+        let transmittances: Vec<f64> = optical_depths.iter().map(|t| (-t).exp()).collect();
         let mut w = vec![0.0; 12];
-        let (counted, transmittance) = weights(&through, &mut w);
-        (through, w, counted, transmittance)
+        let (counted, transmittance) = weights(&transmittances, &mut w);
+        (transmittances, w, counted, transmittance)
     };
-    let (through, w, counted, _) = forward(&optical_depths);
+    let (transmittances, w, counted, _) = forward(&optical_depths);
     let mut gradient = vec![0.0; 12];
-    weights_vjp(&through, &w, &v, counted, &mut gradient);
+    weights_vjp(&transmittances, &w, &v, counted, &mut gradient);
     check("optical depth", &optical_depths, &gradient, 0..12, |t| {
         dot(&forward(t).1, &v)
     });

@@ -157,9 +157,9 @@ fn an_empty_ray_is_transparent() {
 fn weights_are_non_negative_and_sum_to_alpha() {
     let mut rng = irradia_scene::Rng::new(1, 1);
     for round in 0..50 {
-        let through: Vec<f64> = (0..40).map(|_| f64::from(rng.uniform()).powi(round % 4)).collect();
+        let transmittances: Vec<f64> = (0..40).map(|_| f64::from(rng.uniform()).powi(round % 4)).collect();
         let mut w = vec![0.0; 40];
-        let (counted, remaining) = weights(&through, &mut w);
+        let (counted, remaining) = weights(&transmittances, &mut w);
         let mut transmittance = 1.0;
         for weight in &w {
             assert!(*weight >= 0.0);

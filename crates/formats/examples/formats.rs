@@ -50,7 +50,7 @@ fn scene(count: usize, sh_degree: u32) -> GaussianCloud {
 }
 
 /// Peak resident memory of the process since the last reset, bytes; 0 if the system does not report it.
-fn peak() -> u64 {
+fn peak_memory() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find(|line| line.starts_with("VmHWM"));
     line.and_then(|line| line.split_whitespace().nth(1)?.parse::<u64>().ok())
@@ -59,7 +59,7 @@ fn peak() -> u64 {
 }
 
 /// Processor seconds of all threads so far, in steps of 0.01; 0 if the system does not report them.
-fn processor_seconds() -> f64 {
+fn cpu_seconds() -> f64 {
     let status = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
     // The fields after the parenthesised name, which may contain spaces.
     let fields = status.rsplit(')').next().unwrap_or_default();
@@ -68,10 +68,10 @@ fn processor_seconds() -> f64 {
 }
 
 /// Seconds of the best of three runs, their mean processor seconds, and the peak memory beyond that before the first.
-fn best<T>(mut run: impl FnMut() -> T) -> (f64, f64, u64) {
+fn measure<T>(mut run: impl FnMut() -> T) -> (f64, f64, u64) {
     // Writing 5 resets the peak (proc(5)).
     let _ = std::fs::write("/proc/self/clear_refs", "5");
-    let (before, worked) = (peak(), processor_seconds());
+    let (memory_before, cpu_before) = (peak_memory(), cpu_seconds());
     let seconds = (0..3).map(|_| {
         let started = Instant::now();
         std::hint::black_box(run());
@@ -80,8 +80,8 @@ fn best<T>(mut run: impl FnMut() -> T) -> (f64, f64, u64) {
     let seconds = seconds.fold(f64::INFINITY, f64::min);
     (
         seconds,
-        (processor_seconds() - worked) / 3.0,
-        peak().saturating_sub(before),
+        (cpu_seconds() - cpu_before) / 3.0,
+        peak_memory().saturating_sub(memory_before),
     )
 }
 
@@ -138,10 +138,10 @@ fn main() {
     for (name, options) in cases {
         let path = folder.path().join(name);
         let format = SplatFormat::of(&path).expect("known");
-        let (write, write_work, write_memory) = best(|| write_splats_with(&path, &cloud, &options).expect("written"));
+        let (write, write_cpu, write_memory) = measure(|| write_splats_with(&path, &cloud, &options).expect("written"));
         let size = splat_file_size(&path).expect("written");
-        let (read, read_work, read_memory) = match format.is_readable() {
-            true => best(|| read_splats(&path).expect("read")),
+        let (read, read_cpu, read_memory) = match format.is_readable() {
+            true => measure(|| read_splats(&path).expect("read")),
             false => (f64::NAN, f64::NAN, 0),
         };
         let rate = |seconds: f64| {
@@ -165,8 +165,8 @@ fn main() {
             size as f64 / 1e6,
             rate(write),
             rate(read),
-            write_work / count as f64 * 1e6,
-            read_work / count as f64 * 1e6,
+            write_cpu / count as f64 * 1e6,
+            read_cpu / count as f64 * 1e6,
             write_memory as f64 / bytes,
             read_memory as f64 / bytes,
             options.quality

@@ -1,8 +1,8 @@
 use crate::FormatError;
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, OpenOptions};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU64, Ordering};
+use tempfile::NamedTempFile;
 
 /// Writes a file atomically: under a temporary name in the same folder, synced to the disk, then renamed to `path`. If
 /// anything fails, or the process is killed, the previous content of `path` is unchanged. A symbolic link is kept, and the file that
@@ -12,39 +12,38 @@ use std::sync::atomic::{AtomicU64, Ordering};
 /// # Errors
 /// [`FormatError::Write`] with the system's reason, such as a full disk; the temporary file is removed.
 pub fn write_atomic(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(), FormatError> {
-    write_beside(path, write).map_err(|source| FormatError::Write {
+    write_via_temporary(path, write).map_err(|source| FormatError::Write {
         path: path.to_owned(),
         source,
     })
 }
 
-fn write_beside(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> io::Result<()> {
-    let path = &destination(path);
-    if fs::metadata(path).is_ok_and(|found| !found.is_file() && !found.is_dir()) {
+fn write_via_temporary(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> io::Result<()> {
+    let path = &resolve_links(path);
+    if fs::metadata(path).is_ok_and(|metadata| !metadata.is_file() && !metadata.is_dir()) {
         let mut writer = BufWriter::with_capacity(1 << 18, OpenOptions::new().write(true).open(path)?);
         write(&mut writer)?;
         return writer.flush();
     }
-    if let Some(folder) = path.parent().filter(|folder| !folder.as_os_str().is_empty()) {
+    if let Some(folder) = folder_of(path) {
         fs::create_dir_all(folder)?;
     }
-    let (temporary, file) = Temporary::beside(path)?;
-    let mut writer = BufWriter::with_capacity(1 << 18, file);
+    let mut writer = BufWriter::with_capacity(1 << 18, create_beside(path)?);
     write(&mut writer)?;
-    let file = writer.into_inner().map_err(|error| error.into_error())?;
-    file.sync_all()?;
-    drop(file);
-    temporary.become_file(path)
+    let temporary = writer.into_inner().map_err(|error| error.into_error())?;
+    temporary.as_file().sync_all()?;
+    temporary.persist(path)?;
+    Ok(())
 }
 
 /// Where links from `path` lead, also if there is no file yet, which has no canonical path. Links may lead in a circle: as many are followed
 /// as by Linux.
-fn destination(path: &Path) -> PathBuf {
-    const LINKS: usize = 40;
+fn resolve_links(path: &Path) -> PathBuf {
+    const MAX_LINKS: usize = 40;
     let mut path = path.to_owned();
-    for _ in 0..LINKS {
+    for _ in 0..MAX_LINKS {
         match (fs::canonicalize(&path), fs::read_link(&path), path.parent()) {
-            (Ok(found), ..) => return found,
+            (Ok(canonical), ..) => return canonical,
             (_, Ok(target), Some(folder)) => path = folder.join(target),
             _ => break,
         }
@@ -52,46 +51,24 @@ fn destination(path: &Path) -> PathBuf {
     path
 }
 
-/// A file that is removed unless it gets its final name, even if the writing code panics.
-struct Temporary {
-    path: Option<PathBuf>,
+/// A file beside `path` that is removed unless it is renamed, even if the writing code panics. It has the permissions of any new file, which
+/// may be read by others.
+fn create_beside(path: &Path) -> io::Result<NamedTempFile> {
+    let name = path
+        .file_name()
+        .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "the path has no file name"))?
+        .to_string_lossy();
+    let prefix = format!(".{name}.");
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(&prefix).suffix(".tmp");
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    builder.tempfile_in(folder_of(path).unwrap_or(Path::new(".")))
 }
 
-impl Temporary {
-    fn beside(target: &Path) -> io::Result<(Self, File)> {
-        // Two threads, or a killed process with the same id, must not use the same name.
-        static COUNTER: AtomicU64 = AtomicU64::new(0);
-        let name = target
-            .file_name()
-            .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "the path has no file name"))?
-            .to_string_lossy()
-            .into_owned();
-        loop {
-            let number = COUNTER.fetch_add(1, Ordering::Relaxed);
-            let path = target.with_file_name(format!(".{name}.{}-{number}.tmp", std::process::id()));
-            match OpenOptions::new().write(true).create_new(true).open(&path) {
-                Ok(file) => return Ok((Self { path: Some(path) }, file)),
-                Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
-                Err(error) => return Err(error),
-            }
-        }
-    }
-
-    fn become_file(mut self, target: &Path) -> io::Result<()> {
-        let path = self.path.as_ref().expect("set until it is renamed");
-        fs::rename(path, target)?;
-        self.path = None;
-        Ok(())
-    }
-}
-
-impl Drop for Temporary {
-    fn drop(&mut self) {
-        if let Some(path) = &self.path {
-            // The first error is the one to report; this one would hide it.
-            let _ = fs::remove_file(path);
-        }
-    }
+/// The folder of a file; `None` for a mere file name.
+fn folder_of(path: &Path) -> Option<&Path> {
+    path.parent().filter(|folder| !folder.as_os_str().is_empty())
 }
 
 #[cfg(test)]
@@ -141,6 +118,11 @@ mod tests {
         .unwrap_err();
         assert!(error.to_string().contains("a.bin") && error.to_string().contains("no space left"));
         assert_eq!(fs::read(&path).unwrap(), b"first");
+        let plain = folder.path().join("plain");
+        fs::write(&plain, b"").unwrap();
+        let [written, usual] = [&path, &plain].map(|path| fs::metadata(path).unwrap().permissions());
+        assert_eq!(written, usual);
+        fs::remove_file(&plain).unwrap();
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
         write_atomic(&path, |w| w.write_all(b"second")).unwrap();
         assert_eq!(fs::read(&path).unwrap(), b"second");

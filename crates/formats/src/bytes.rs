@@ -1,12 +1,12 @@
 use crate::Malformed;
 
 /// Reads little-endian values from a byte slice; reading past its end is an error that names the position.
-pub(crate) struct Bytes<'a> {
+pub(crate) struct ByteReader<'a> {
     rest: &'a [u8],
     total: usize,
 }
 
-impl<'a> Bytes<'a> {
+impl<'a> ByteReader<'a> {
     pub fn new(bytes: &'a [u8]) -> Self {
         Self {
             rest: bytes,
@@ -83,14 +83,14 @@ impl<'a> Bytes<'a> {
         Ok(text)
     }
 
-    /// A u64 count of records of at least `least` bytes each, checked against the remaining bytes before any allocation.
-    pub fn count(&mut self, least: usize, what: &str) -> Result<usize, Malformed> {
+    /// A u64 count of records of at least `min_record_bytes` bytes each, checked against the remaining bytes before any allocation.
+    pub fn count(&mut self, min_record_bytes: usize, label: &str) -> Result<usize, Malformed> {
         let declared = self.u64()?;
-        let possible = self.rest.len() / least;
+        let max_count = self.rest.len() / min_record_bytes;
         match usize::try_from(declared) {
-            Ok(count) if count <= possible => Ok(count),
+            Ok(count) if count <= max_count => Ok(count),
             _ => Err(Malformed(format!(
-                "declares {declared} {what}, but the {} bytes that follow hold at most {possible}; the file is damaged",
+                "declares {declared} {label}, but the {} bytes that follow hold at most {max_count}; the file is damaged",
                 self.rest.len()
             ))),
         }

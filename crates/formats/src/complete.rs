@@ -4,7 +4,7 @@
 use std::io::{self, BufRead, Seek};
 
 /// Length of the end of a file, bytes, in which its last marker is usually found.
-const TAIL: u64 = 4096;
+const TAIL_BYTES: u64 = 4096;
 
 /// Whether a JPEG in memory has its end-of-image marker after the start of its scan.
 ///
@@ -28,23 +28,23 @@ pub(crate) fn jpeg_is_complete(bytes: &[u8]) -> bool {
 /// [`jpeg_is_complete`] for a file: reads its headers and its end, and the whole file only if the end has no marker.
 pub(crate) fn jpeg_file_is_complete(reader: &mut (impl BufRead + Seek)) -> io::Result<bool> {
     let length = reader.seek(io::SeekFrom::End(0))?;
-    let mut at = 2;
+    let mut offset = 2;
     loop {
-        if at + 4 > length {
+        if offset + 4 > length {
             return Ok(false);
         }
-        reader.seek(io::SeekFrom::Start(at))?;
-        let mut head = [0u8; 4];
-        reader.read_exact(&mut head)?;
-        match head {
-            [0xFF, 0xFF, ..] => at += 1,
+        reader.seek(io::SeekFrom::Start(offset))?;
+        let mut header = [0u8; 4];
+        reader.read_exact(&mut header)?;
+        match header {
+            [0xFF, 0xFF, ..] => offset += 1,
             [0xFF, 0xDA, ..] => break,
-            [0xFF, _, high, low] => at += 2 + u64::from(u16::from_be_bytes([high, low])),
+            [0xFF, _, high, low] => offset += 2 + u64::from(u16::from_be_bytes([high, low])),
             _ => return Ok(false),
         }
     }
-    for tail in [TAIL, length] {
-        reader.seek(io::SeekFrom::Start((at + 2).max(length.saturating_sub(tail))))?;
+    for tail in [TAIL_BYTES, length] {
+        reader.seek(io::SeekFrom::Start((offset + 2).max(length.saturating_sub(tail))))?;
         let mut bytes = Vec::new();
         reader.read_to_end(&mut bytes)?;
         if bytes.windows(2).rev().any(|pair| pair == [0xFF, 0xD9]) {
@@ -57,15 +57,15 @@ pub(crate) fn jpeg_file_is_complete(reader: &mut (impl BufRead + Seek)) -> io::R
 /// Whether a PNG's chunks lead to its `IEND`. The reader's position afterwards is arbitrary.
 pub(crate) fn png_is_complete(reader: &mut (impl BufRead + Seek)) -> io::Result<bool> {
     let length = reader.seek(io::SeekFrom::End(0))?;
-    let mut at = 8;
-    while at + 12 <= length {
-        reader.seek(io::SeekFrom::Start(at))?;
-        let mut head = [0u8; 8];
-        reader.read_exact(&mut head)?;
-        if head[4..] == *b"IEND" {
+    let mut offset = 8;
+    while offset + 12 <= length {
+        reader.seek(io::SeekFrom::Start(offset))?;
+        let mut header = [0u8; 8];
+        reader.read_exact(&mut header)?;
+        if header[4..] == *b"IEND" {
             return Ok(true);
         }
-        at += 12 + u64::from(u32::from_be_bytes([head[0], head[1], head[2], head[3]]));
+        offset += 12 + u64::from(u32::from_be_bytes([header[0], header[1], header[2], header[3]]));
     }
     Ok(false)
 }

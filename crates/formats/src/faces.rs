@@ -15,23 +15,23 @@ use std::f64::consts::{FRAC_PI_2, PI};
 use std::path::Path;
 
 /// A photograph of a wide lens is cut into faces if one pinhole image shows less than this fraction of it.
-const SHOWN: f64 = 0.7;
+const MIN_SHOWN_FRACTION: f64 = 0.7;
 /// Samples along each side of the photograph by which that fraction is measured.
-const SAMPLES: u32 = 48;
+const SAMPLES_PER_SIDE: u32 = 48;
 /// Minimum side of a face relative to that of the cube: a smaller face is a strip that only costs time.
-const SMALLEST: f64 = 1.0 / 8.0;
+const MIN_FACE_FRACTION: f64 = 1.0 / 8.0;
 /// Longer side of the small copies in which the image circle is searched, pixels.
-const SIDE: u32 = 256;
+const CIRCLE_IMAGE_SIDE: u32 = 256;
 /// Maximum value, of 255, of the black around an image circle.
-const BLACK: u8 = 20;
+const MAX_BLACK: u8 = 20;
 /// Fraction of the image circle's radius that faces use: the rim is dark and blurred.
-const RIM: f64 = 0.98;
+const USED_RADIUS_FRACTION: f64 = 0.98;
 
 /// A side of the cube around a camera: the suffix of the photograph's name, and the rotation from its axes to the photograph's.
-type Side = (&'static str, DQuat);
+type CubeFace = (&'static str, DQuat);
 
 /// The sides in the order of their names.
-pub(crate) fn sides() -> [Side; 6] {
+pub(crate) fn cube_faces() -> [CubeFace; 6] {
     [
         ("back", DQuat::from_xyzw(0.0, 1.0, 0.0, 0.0)),
         ("down", DQuat::from_rotation_x(-FRAC_PI_2)),
@@ -44,32 +44,32 @@ pub(crate) fn sides() -> [Side; 6] {
 
 /// The pinhole images made from each photograph of a camera.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) enum Cut {
+pub(crate) enum PinholeImages {
     /// One image.
-    Whole(Box<Undistortion>),
+    Single(Box<Undistortion>),
     /// Several images, each with its suffix of the photograph's name.
     Faces(Vec<(&'static str, Undistortion)>),
 }
 
-impl Cut {
-    /// One image if it shows most of a photograph; otherwise faces, limited to the image `circle` (radians from the axis) if there is
+impl PinholeImages {
+    /// One image if it shows most of a photograph; otherwise faces, limited to `circle_angle` (radians from the axis) if there is
     /// one. `None` if the lens leaves no valid image.
-    pub fn plan(source: &Intrinsics, circle: impl FnOnce() -> Option<f64>) -> Option<Self> {
+    pub fn plan(source: &Intrinsics, circle_angle: impl FnOnce() -> Option<f64>) -> Option<Self> {
         let whole = (source.lens != Lens::Equirectangular)
             .then(|| Undistortion::plan(source))
             .flatten();
         if !source.lens.is_wide() {
-            return whole.map(|plan| Cut::Whole(Box::new(plan)));
+            return whole.map(|plan| PinholeImages::Single(Box::new(plan)));
         }
-        let reach = source.lens.reach_in_angle();
+        let max_angle = source.lens.reach_in_angle();
         if let Some(plan) = whole
-            && shown(source, reach, &plan) >= SHOWN
+            && shown_fraction(source, max_angle, &plan) >= MIN_SHOWN_FRACTION
         {
-            return Some(Cut::Whole(Box::new(plan)));
+            return Some(PinholeImages::Single(Box::new(plan)));
         }
-        let reach = circle().map_or(reach, |circle| circle.min(reach));
-        let faces = faces(source, reach);
-        (!faces.is_empty()).then_some(Cut::Faces(faces))
+        let max_angle = circle_angle().map_or(max_angle, |circle_angle| circle_angle.min(max_angle));
+        let faces = plan_faces(source, max_angle);
+        (!faces.is_empty()).then_some(PinholeImages::Faces(faces))
     }
 }
 
@@ -85,7 +85,7 @@ pub(crate) fn panorama_faces(width: u32, height: u32) -> Vec<(&'static str, Undi
         cy: 0.5 * height as f32,
         lens: Lens::Equirectangular,
     };
-    faces(&source, PI)
+    plan_faces(&source, PI)
 }
 
 /// The angle between a direction and the axis, radians.
@@ -93,39 +93,40 @@ fn angle(direction: DVec3) -> f64 {
     direction.truncate().length().atan2(direction.z)
 }
 
-/// The fraction of the photograph's pixels within `reach` (radians from the axis) that `plan`'s image shows.
-fn shown(source: &Intrinsics, reach: f64, plan: &Undistortion) -> f64 {
-    let (mut all, mut seen) = (0u32, 0u32);
-    for row in 0..SAMPLES {
-        for column in 0..SAMPLES {
+/// The fraction of the photograph's pixels within `max_angle` (radians from the axis) that `plan`'s image shows.
+fn shown_fraction(source: &Intrinsics, max_angle: f64, plan: &Undistortion) -> f64 {
+    let (mut total, mut shown) = (0u32, 0u32);
+    for row in 0..SAMPLES_PER_SIDE {
+        for column in 0..SAMPLES_PER_SIDE {
             let at = [(column, source.width), (row, source.height)];
-            let [x, y] = at.map(|(i, side)| (f64::from(i) + 0.5) / f64::from(SAMPLES) * f64::from(side));
+            let [x, y] = at.map(|(i, side)| (f64::from(i) + 0.5) / f64::from(SAMPLES_PER_SIDE) * f64::from(side));
             let direction = source.lens.direction(source.plane_of(DVec2::new(x, y)));
-            if direction.is_some_and(|direction| angle(direction) < reach) {
-                all += 1;
-                seen += u32::from(plan.shows(x, y));
+            if direction.is_some_and(|direction| angle(direction) < max_angle) {
+                total += 1;
+                shown += u32::from(plan.shows(x, y));
             }
         }
     }
-    f64::from(seen) / f64::from(all.max(1))
+    f64::from(shown) / f64::from(total.max(1))
 }
 
-/// The sides of a cube, cropped to what the photograph shows within `reach` (radians from its axis), at its resolution at their centres.
-fn faces(source: &Intrinsics, reach: f64) -> Vec<(&'static str, Undistortion)> {
+/// The sides of a cube, cropped to what the photograph shows within `max_angle` (radians from its axis), at its resolution at their
+/// centres.
+fn plan_faces(source: &Intrinsics, max_angle: f64) -> Vec<(&'static str, Undistortion)> {
     let focal = 0.5 * (source.fx + source.fy);
     let side = (2.0 * focal).round().max(1.0) as u32;
     let pinhole = Intrinsics::from_fov_x(side, side, FRAC_PI_2 as f32);
-    let face = |(name, turn): Side| {
+    let face = |(name, rotation): CubeFace| {
         // The back face of a camera that does not see straight behind itself would have a hole.
-        if turn * DVec3::Z == DVec3::NEG_Z && reach < PI {
+        if rotation * DVec3::Z == DVec3::NEG_Z && max_angle < PI {
             return None;
         }
-        let plan = Undistortion::turned(source, pinhole, turn, |direction| angle(direction) < reach)?;
+        let plan = Undistortion::rotated(source, pinhole, rotation, |direction| angle(direction) < max_angle)?;
         let k = plan.pinhole();
-        let is_large = f64::from(k.width.min(k.height)) >= SMALLEST * f64::from(side);
+        let is_large = f64::from(k.width.min(k.height)) >= MIN_FACE_FRACTION * f64::from(side);
         is_large.then_some((name, plan))
     };
-    sides().into_iter().filter_map(face).collect()
+    cube_faces().into_iter().filter_map(face).collect()
 }
 
 /// The radius of a fisheye's image circle, as the angle from its axis in radians; `None` if the corners of the photographs are not
@@ -137,25 +138,25 @@ pub(crate) fn image_circle<'a>(
     source: &Intrinsics,
     photographs: impl Iterator<Item = (&'a Path, Orientation)>,
 ) -> Result<Option<f64>, FormatError> {
-    let (width, height) = small(source);
+    let (width, height) = circle_image_size(source);
     let mut brightest = vec![0u8; (width * height) as usize];
     for (path, orientation) in photographs {
         let pixels = decode(path, orientation, Colour::Keep)?;
-        for (most, pixel) in brightest.iter_mut().zip(values(&pixels, width, height)) {
-            *most = (*most).max(pixel);
+        for (max, pixel) in brightest.iter_mut().zip(max_channels(&pixels, width, height)) {
+            *max = (*max).max(pixel);
         }
     }
-    Ok(circle(source, width, height, &brightest))
+    Ok(circle_angle(source, width, height, &brightest))
 }
 
 /// The size at which the circle is searched.
-fn small(source: &Intrinsics) -> (u32, u32) {
-    let k = source.scaled((SIDE as f32 / source.width.max(source.height) as f32).min(1.0));
+fn circle_image_size(source: &Intrinsics) -> (u32, u32) {
+    let k = source.scaled((CIRCLE_IMAGE_SIDE as f32 / source.width.max(source.height) as f32).min(1.0));
     (k.width, k.height)
 }
 
 /// The largest channel of each pixel of a smaller copy, 0 where it is transparent.
-fn values(from: &Pixels, width: u32, height: u32) -> Vec<u8> {
+fn max_channels(from: &Pixels, width: u32, height: u32) -> Vec<u8> {
     let channels = from.channels as usize;
     let data = resize_area(&from.data, from.channels, [from.width, from.height], [width, height]);
     let value = |pixel: &[u8]| match pixel {
@@ -168,24 +169,26 @@ fn values(from: &Pixels, width: u32, height: u32) -> Vec<u8> {
 }
 
 /// See [`image_circle`]; `brightest` is `[height, width]`, the largest value of each pixel in any photograph.
-fn circle(source: &Intrinsics, width: u32, height: u32, brightest: &[u8]) -> Option<f64> {
+fn circle_angle(source: &Intrinsics, width: u32, height: u32, brightest: &[u8]) -> Option<f64> {
     let k = source.resized(width, height);
     let corners = [0, width - 1, (height - 1) * width, height * width - 1];
-    if corners.iter().any(|at| brightest[*at as usize] > BLACK) {
+    if corners.iter().any(|at| brightest[*at as usize] > MAX_BLACK) {
         return None;
     }
     // Rings one pixel wide; from the outermost inwards, the first that is mostly not black.
-    let ring = 1.0 / f64::from(k.fx.min(k.fy));
+    let ring_width = 1.0 / f64::from(k.fx.min(k.fy));
     let mut rings: Vec<[u32; 2]> = Vec::new();
     for (at, value) in (0u32..).zip(brightest) {
         let (x, y) = (f64::from(at % width) + 0.5, f64::from(at / width) + 0.5);
-        let index = (k.plane_of(DVec2::new(x, y)).length() / ring) as usize;
+        let index = (k.plane_of(DVec2::new(x, y)).length() / ring_width) as usize;
         rings.resize(rings.len().max(index + 1), [0; 2]);
         rings[index][0] += 1;
-        rings[index][1] += u32::from(*value > BLACK);
+        rings[index][1] += u32::from(*value > MAX_BLACK);
     }
     let rim = rings.iter().rposition(|[all, lit]| *all > 0 && 2 * lit > *all)?;
-    let direction = k.lens.direction(DVec2::new(RIM * (rim as f64 + 0.5) * ring, 0.0))?;
+    let direction = k
+        .lens
+        .direction(DVec2::new(USED_RADIUS_FRACTION * (rim as f64 + 0.5) * ring_width, 0.0))?;
     Some(angle(direction))
 }
 
@@ -235,10 +238,10 @@ mod tests {
         }
     }
 
-    fn cut(k: &Intrinsics) -> Vec<(&'static str, Undistortion)> {
-        match Cut::plan(k, || None).expect("a plan") {
-            Cut::Faces(faces) => faces,
-            Cut::Whole(whole) => panic!("{whole:?}"),
+    fn faces_of(k: &Intrinsics) -> Vec<(&'static str, Undistortion)> {
+        match PinholeImages::plan(k, || None).expect("a plan") {
+            PinholeImages::Faces(faces) => faces,
+            PinholeImages::Single(whole) => panic!("{whole:?}"),
         }
     }
 
@@ -249,7 +252,7 @@ mod tests {
             camera(Lens::fisheye([0.01, 0.002, 0.0, 0.0]), 360, 360, [100.0, 102.0]),
         ] {
             let photo = photograph(&k);
-            for (name, plan) in cut(&k) {
+            for (name, plan) in faces_of(&k) {
                 let image = plan.apply(&photo);
                 let pinhole = plan.pinhole();
                 assert_eq!((image.width, image.height), (pinhole.width, pinhole.height));
@@ -259,7 +262,7 @@ mod tests {
                     let ray = pinhole
                         .plane_of(DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5))
                         .extend(1.0);
-                    for (value, expected) in pixel.iter().zip(color(plan.turn() * ray)) {
+                    for (value, expected) in pixel.iter().zip(color(plan.rotation() * ray)) {
                         worst = worst.max((f64::from(*value) - expected).abs());
                     }
                 }
@@ -281,7 +284,10 @@ mod tests {
             channels: 1,
             data: row.collect::<Vec<_>>().repeat(k.height as usize),
         };
-        for (name, plan) in cut(&k).into_iter().filter(|(name, _)| !matches!(*name, "up" | "down")) {
+        for (name, plan) in faces_of(&k)
+            .into_iter()
+            .filter(|(name, _)| !matches!(*name, "up" | "down"))
+        {
             let (image, pinhole) = (plan.apply(&photo), plan.pinhole());
             let y = image.height / 2;
             let mut worst = 0f64;
@@ -289,7 +295,7 @@ mod tests {
                 let ray = pinhole
                     .plane_of(DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5))
                     .extend(1.0);
-                let direction = plan.turn() * ray;
+                let direction = plan.rotation() * ray;
                 let value = image.data[(y * image.width + x) as usize];
                 worst = worst.max((f64::from(value) - stripes(direction.x.atan2(direction.z))).abs());
             }
@@ -299,7 +305,7 @@ mod tests {
 
     #[test]
     fn a_panorama_has_six_whole_faces() {
-        let faces = cut(&panorama(512));
+        let faces = faces_of(&panorama(512));
         let names: Vec<_> = faces.iter().map(|(name, _)| *name).collect();
         assert_eq!(names, ["back", "down", "front", "left", "right", "up"]);
         for (name, plan) in faces {
@@ -316,7 +322,7 @@ mod tests {
     fn a_half_turn_has_a_front_and_half_of_four_sides() {
         let k = camera(Lens::fisheye([0.0; 4]), 314, 314, [100.0; 2]);
         // The corners are beyond the half turn, and would be black in a photograph of such a lens.
-        let Some(Cut::Faces(faces)) = Cut::plan(&k, || Some(FRAC_PI_2)) else {
+        let Some(PinholeImages::Faces(faces)) = PinholeImages::plan(&k, || Some(FRAC_PI_2)) else {
             panic!("faces")
         };
         let sizes: Vec<_> = faces
@@ -340,7 +346,10 @@ mod tests {
     #[test]
     fn moderate_fisheyes_stay_one_image() {
         let k = camera(Lens::fisheye([0.02, -0.01, 0.003, -0.0005]), 320, 240, [250.0; 2]);
-        assert!(matches!(Cut::plan(&k, || panic!("not asked for")), Some(Cut::Whole(_))));
+        assert!(matches!(
+            PinholeImages::plan(&k, || panic!("not asked for")),
+            Some(PinholeImages::Single(_))
+        ));
     }
 
     #[test]
@@ -352,9 +361,9 @@ mod tests {
                 .map(|at| if distance(at) < radius { 90 } else { 5 })
                 .collect()
         };
-        let found = circle(&k, 256, 192, &lit(94.0)).expect("a circle");
-        assert!((found - RIM * 94.0 / 60.0).abs() < 0.02, "{found}");
-        assert_eq!(circle(&k, 256, 192, &lit(1000.0)), None);
-        assert_eq!(circle(&k, 256, 192, &lit(0.0)), None);
+        let found = circle_angle(&k, 256, 192, &lit(94.0)).expect("a circle");
+        assert!((found - USED_RADIUS_FRACTION * 94.0 / 60.0).abs() < 0.02, "{found}");
+        assert_eq!(circle_angle(&k, 256, 192, &lit(1000.0)), None);
+        assert_eq!(circle_angle(&k, 256, 192, &lit(0.0)), None);
     }
 }

@@ -11,13 +11,13 @@ use image::{ColorType, ImageDecoder, ImageError, ImageResult};
 const MAX_PIXELS: u64 = 1 << 28;
 
 /// Many photographs are decoded at a time; more threads per photograph would only contend with each other.
-const ONE_THREAD: Options = Options {
+const DECODE_OPTIONS: Options = Options {
     max_threads: 1,
     max_pixels: MAX_PIXELS,
 };
 
 /// Kinds of auxiliary images that hold alpha (ISO/IEC 23008-12, 6.5.8 and annex B).
-const ALPHA: [&str; 2] = [
+const ALPHA_TYPES: [&str; 2] = [
     "urn:mpeg:hevc:2015:auxid:1",
     "urn:mpeg:mpegB:cicp:systems:auxiliary:alpha",
 ];
@@ -56,8 +56,9 @@ fn read_container(bytes: &[u8]) -> Result<((u32, u32), bool), heifer::Error> {
     }
     let is_alpha = |item: ItemId| {
         file.item_properties(item).is_ok_and(|mut properties| {
-            properties
-                .any(|property| matches!(property, Property::AuxiliaryType(kind) if ALPHA.contains(&kind.as_str())))
+            properties.any(
+                |property| matches!(property, Property::AuxiliaryType(kind) if ALPHA_TYPES.contains(&kind.as_str())),
+            )
         })
     };
     let has_alpha = file.referencing_items(picture, b"auxl").into_iter().any(is_alpha);
@@ -75,13 +76,13 @@ fn displayed_size(file: &HeifFile, picture: ItemId) -> Result<(u32, u32), heifer
     for property in file.item_properties(picture)? {
         match *property {
             Property::CleanAperture {
-                width: across,
-                height: down,
+                width: aperture_width,
+                height: aperture_height,
                 horiz_offset,
                 vert_offset,
             } => {
-                width = cropped(width, across, horiz_offset);
-                height = cropped(height, down, vert_offset);
+                width = cropped(width, aperture_width, horiz_offset);
+                height = cropped(height, aperture_height, vert_offset);
             }
             Property::Rotation(quarters) if quarters % 2 == 1 => (width, height) = (height, width),
             _ => {}
@@ -122,7 +123,7 @@ impl ImageDecoder for HeicDecoder {
     }
 
     fn read_image(self, out: &mut [u8]) -> ImageResult<()> {
-        let picture = decode_rgba8(&self.bytes, &ONE_THREAD).map_err(undecodable)?;
+        let picture = decode_rgba8(&self.bytes, &DECODE_OPTIONS).map_err(undecodable)?;
         if (picture.width, picture.height) != self.size {
             return Err(undecodable(heifer::Error::Invalid("not of the size that it declares")));
         }

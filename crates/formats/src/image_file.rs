@@ -125,15 +125,15 @@ pub fn write_png_16(path: &Path, width: u32, height: u32, data: &[u16]) -> Resul
 
 impl Header {
     /// Whether the stored image is landscape or portrait like an image of `upright` size.
-    pub fn lies_as(&self, (width, height): (u32, u32)) -> bool {
+    pub fn has_aspect_of(&self, (width, height): (u32, u32)) -> bool {
         (self.width > self.height) == (width > height)
     }
 
-    /// The orientation to apply to this mask or map of a photograph that has the orientation `photograph` and the size `upright`. Masks
-    /// and maps are made from the pixels as some tool displays them and rarely have EXIF data, so one with the aspect of the stored
+    /// The orientation to apply to this mask or map of a photograph that has the orientation `photograph` and the size `upright_size`.
+    /// Masks and maps are made from the pixels as some tool displays them and rarely have EXIF data, so one with the aspect of the stored
     /// photograph is rotated like it.
-    pub fn turned_with(&self, photograph: Orientation, upright: (u32, u32)) -> Orientation {
-        if self.lies_as(upright) {
+    pub fn orientation_from_photo(&self, photograph: Orientation, upright_size: (u32, u32)) -> Orientation {
+        if self.has_aspect_of(upright_size) {
             Orientation::NoTransforms
         } else {
             photograph
@@ -166,18 +166,18 @@ pub(crate) fn read_header(path: &Path) -> Result<Header, FormatError> {
 
 /// The header of a JPEG; reads only the file's headers and end. `None` if it is not a JPEG, or needs the other decoder.
 fn read_jpeg_header(path: &Path) -> Result<Option<Header>, FormatError> {
-    let read = |source| FormatError::Read {
+    let read_error = |source| FormatError::Read {
         path: path.to_owned(),
         source,
     };
-    let mut reader = BufReader::new(File::open(path).map_err(read)?);
-    if !reader.fill_buf().map_err(read)?.starts_with(&[0xFF, 0xD8]) {
+    let mut reader = BufReader::new(File::open(path).map_err(read_error)?);
+    if !reader.fill_buf().map_err(read_error)?.starts_with(&[0xFF, 0xD8]) {
         return Ok(None);
     }
-    if !jpeg_file_is_complete(&mut reader).map_err(read)? {
+    if !jpeg_file_is_complete(&mut reader).map_err(read_error)? {
         return Err(truncated(path));
     }
-    reader.rewind().map_err(read)?;
+    reader.rewind().map_err(read_error)?;
     let mut decoder = jpeg_decoder::Decoder::new(reader);
     let size = decoder.read_info().ok().and_then(|()| decoder.info());
     let exif = decoder.exif_data().and_then(Orientation::from_exif_chunk);
@@ -225,7 +225,7 @@ pub(crate) fn read_metadata(path: &Path) -> Metadata {
 pub(crate) fn decode(path: &Path, orientation: Orientation, colour: Colour) -> Result<Pixels, FormatError> {
     let (decoder, _) = open(path)?;
     let image = DynamicImage::from_decoder(decoder).map_err(|error| undecodable(path, &error))?;
-    Ok(upright(image, orientation, colour))
+    Ok(oriented_pixels(image, orientation, colour))
 }
 
 /// The pixels of a mask, 0 to 255; a mask of zeros and ones is scaled to that range.
@@ -240,13 +240,13 @@ pub(crate) fn decode_mask(path: &Path, orientation: Orientation) -> Result<Pixel
 /// The pixels of a HEIC image in memory.
 pub(crate) fn decode_heic(bytes: &[u8]) -> Result<Pixels, image::ImageError> {
     let image = DynamicImage::from_decoder(HeicDecoder::new(bytes.to_vec())?)?;
-    Ok(upright(image, Orientation::NoTransforms, Colour::Keep))
+    Ok(oriented_pixels(image, Orientation::NoTransforms, Colour::Keep))
 }
 
 /// The pixels of an `OpenEXR` image in memory.
 pub(crate) fn decode_exr(bytes: &[u8]) -> Result<Pixels, image::ImageError> {
     let image = DynamicImage::from_decoder(ExrDecoder::new(Cursor::new(bytes))?)?;
-    Ok(upright(image, Orientation::NoTransforms, Colour::Keep))
+    Ok(oriented_pixels(image, Orientation::NoTransforms, Colour::Keep))
 }
 
 /// The values of a grey image as stored (8 bits, 16 bits or `OpenEXR`): width, height and `[H, W]`.
@@ -254,16 +254,16 @@ pub(crate) fn decode_exr(bytes: &[u8]) -> Result<Pixels, image::ImageError> {
 /// # Errors
 /// When it cannot be decoded or is in colour.
 pub(crate) fn decode_values(path: &Path, orientation: Orientation) -> Result<(u32, u32, Vec<f32>), FormatError> {
-    let in_colours = || {
+    let color_error = || {
         let message = "is a colour image, not a map of values; store the values as 8- or 16-bit grey, single-channel OpenEXR, or .npy";
         FormatError::malformed(path, message)
     };
     if let Some(decoder) = open_exr(path)? {
         let read = decoder.read_depths().map_err(|error| undecodable(path, &error))?;
-        let (width, height, values) = read.ok_or_else(in_colours)?;
+        let (width, height, values) = read.ok_or_else(color_error)?;
         // Three equal channels, since an image of one float channel cannot be rotated.
-        let thrice = values.into_iter().flat_map(|value| [value; 3]).collect();
-        let image = Rgb32FImage::from_raw(width, height, thrice).ok_or_else(in_colours)?;
+        let tripled = values.into_iter().flat_map(|value| [value; 3]).collect();
+        let image = Rgb32FImage::from_raw(width, height, tripled).ok_or_else(color_error)?;
         let mut image = DynamicImage::from(image);
         image.apply_orientation(orientation);
         let values = image.to_rgb32f().pixels().map(|pixel| pixel.0[0]).collect();
@@ -281,7 +281,7 @@ pub(crate) fn decode_values(path: &Path, orientation: Orientation) -> Result<(u3
         rgb.pixels().map_while(|pixel| grey(pixel.0)).map(f32::from).collect()
     };
     if values.len() != width as usize * height as usize {
-        return Err(in_colours());
+        return Err(color_error());
     }
     Ok((width, height, values))
 }
@@ -315,7 +315,7 @@ fn grey<T: PartialEq + Copy>([red, green, blue]: [T; 3]) -> Option<T> {
 }
 
 /// `image` with `orientation` applied.
-fn upright(mut image: DynamicImage, orientation: Orientation, colour: Colour) -> Pixels {
+fn oriented_pixels(mut image: DynamicImage, orientation: Orientation, colour: Colour) -> Pixels {
     image.apply_orientation(orientation);
     let (width, height) = (image.width(), image.height());
     let (channels, data) = match colour {
@@ -333,27 +333,27 @@ fn upright(mut image: DynamicImage, orientation: Orientation, colour: Colour) ->
 
 /// The pixels of a JPEG at 1 / `divisor` of its size, rounded up, with `orientation` applied. For `divisor` 2, 4 or 8, only the low
 /// frequencies of each block of 8 x 8 pixels are transformed (ITU-T T.81, A.3.3), which takes a fraction of the time and memory.
-pub(crate) fn decode_jpeg_at(path: &Path, divisor: u32, orientation: Orientation) -> Result<Pixels, FormatError> {
-    let read = |source| FormatError::Read {
+pub(crate) fn decode_jpeg_scaled(path: &Path, divisor: u32, orientation: Orientation) -> Result<Pixels, FormatError> {
+    let read_error = |source| FormatError::Read {
         path: path.to_owned(),
         source,
     };
-    let wrong = |error: jpeg_decoder::Error| {
+    let jpeg_error = |error: jpeg_decoder::Error| {
         FormatError::malformed(
             path,
             format!("not a readable JPEG image ({error}); restore or remove it"),
         )
     };
-    let bytes = std::fs::read(path).map_err(read)?;
+    let bytes = std::fs::read(path).map_err(read_error)?;
     if !jpeg_is_complete(&bytes) {
         return Err(truncated(path));
     }
     let mut decoder = jpeg_decoder::Decoder::new(&bytes[..]);
-    decoder.read_info().map_err(wrong)?;
+    decoder.read_info().map_err(jpeg_error)?;
     let [full_width, full_height] = decoder.info().map_or([0; 2], |info| [info.width, info.height]);
     let size = [full_width, full_height].map(|side| u32::from(side).div_ceil(divisor).max(1));
-    decoder.scale(size[0] as u16, size[1] as u16).map_err(wrong)?;
-    let data = decoder.decode().map_err(wrong)?;
+    decoder.scale(size[0] as u16, size[1] as u16).map_err(jpeg_error)?;
+    let data = decoder.decode().map_err(jpeg_error)?;
     let info = decoder
         .info()
         .filter(|info| [info.width, info.height].map(u32::from) == size);
@@ -365,7 +365,7 @@ pub(crate) fn decode_jpeg_at(path: &Path, divisor: u32, orientation: Orientation
         _ => None,
     };
     if let Some(image) = image {
-        return Ok(upright(image, orientation, Colour::Keep));
+        return Ok(oriented_pixels(image, orientation, Colour::Keep));
     }
     let full = decode(path, orientation, Colour::Keep)?;
     let to = [full.width.div_ceil(divisor), full.height.div_ceil(divisor)];
@@ -390,12 +390,12 @@ impl<T: BufRead + Seek> Source for T {}
 
 /// The decoder of an `OpenEXR` file; `None` if it has another format.
 fn open_exr(path: &Path) -> Result<Option<ExrDecoder<BufReader<File>>>, FormatError> {
-    let unread = |source| FormatError::Read {
+    let read_error = |source| FormatError::Read {
         path: path.to_owned(),
         source,
     };
-    let mut reader = BufReader::new(File::open(path).map_err(unread)?);
-    if !is_exr(reader.fill_buf().map_err(unread)?) {
+    let mut reader = BufReader::new(File::open(path).map_err(read_error)?);
+    if !is_exr(reader.fill_buf().map_err(read_error)?) {
         return Ok(None);
     }
     let decoder = ExrDecoder::new(reader).map_err(|error| undecodable(path, &error))?;
@@ -404,27 +404,27 @@ fn open_exr(path: &Path) -> Result<Option<ExrDecoder<BufReader<File>>>, FormatEr
 
 /// Opens an image, and returns whether it is a JPEG; the format is detected by the first bytes. A truncated file is an error.
 fn open(path: &Path) -> Result<(Box<dyn ImageDecoder>, bool), FormatError> {
-    let unread = |source| FormatError::Read {
+    let read_error = |source| FormatError::Read {
         path: path.to_owned(),
         source,
     };
-    let mut reader = BufReader::new(File::open(path).map_err(unread)?);
-    let start = reader.fill_buf().map_err(unread)?;
+    let mut reader = BufReader::new(File::open(path).map_err(read_error)?);
+    let start = reader.fill_buf().map_err(read_error)?;
     if is_exr(start) {
         let decoder = ExrDecoder::new(reader).map_err(|error| undecodable(path, &error))?;
         return Ok((Box::new(decoder), false));
     }
     if is_heif(start) {
         let mut bytes = Vec::new();
-        reader.read_to_end(&mut bytes).map_err(unread)?;
+        reader.read_to_end(&mut bytes).map_err(read_error)?;
         let decoder = HeicDecoder::new(bytes).map_err(|error| undecodable(path, &error))?;
         return Ok((Box::new(decoder), false));
     }
-    let (source, complete, jpeg) = complete_source(reader).map_err(unread)?;
+    let (source, complete, jpeg) = complete_source(reader).map_err(read_error)?;
     if !complete {
         return Err(truncated(path));
     }
-    let reader = ImageReader::new(source).with_guessed_format().map_err(unread)?;
+    let reader = ImageReader::new(source).with_guessed_format().map_err(read_error)?;
     let decoder = reader.into_decoder().map_err(|error| undecodable(path, &error))?;
     Ok((Box::new(decoder), jpeg))
 }
@@ -501,7 +501,7 @@ mod tests {
         image::RgbImage::from_fn(101, 67, smooth).save(&path).unwrap();
         let full = read_image(&path).unwrap();
         for divisor in [2, 4, 8] {
-            let small = decode_jpeg_at(&path, divisor, Orientation::NoTransforms).unwrap();
+            let small = decode_jpeg_scaled(&path, divisor, Orientation::NoTransforms).unwrap();
             let to = [101u32.div_ceil(divisor), 67u32.div_ceil(divisor)];
             assert_eq!([small.width, small.height], to);
             let block = |x: u32, y: u32, c: u32| {
@@ -519,13 +519,13 @@ mod tests {
                     block(x, y, c)
                 );
             }
-            let turned = decode_jpeg_at(&path, divisor, Orientation::Rotate90).unwrap();
+            let turned = decode_jpeg_scaled(&path, divisor, Orientation::Rotate90).unwrap();
             assert_eq!([turned.width, turned.height], [to[1], to[0]]);
         }
         let bytes = std::fs::read(&path).unwrap();
         std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
         assert!(
-            decode_jpeg_at(&path, 2, Orientation::NoTransforms)
+            decode_jpeg_scaled(&path, 2, Orientation::NoTransforms)
                 .unwrap_err()
                 .to_string()
                 .contains("truncated")

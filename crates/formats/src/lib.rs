@@ -22,11 +22,11 @@ mod photo;
 mod photos;
 mod ply;
 mod points_ply;
-mod shown;
 mod splats;
 mod tensors;
 mod undistort;
 mod unpack;
+mod valid_region;
 mod xml;
 mod zip;
 
@@ -35,8 +35,8 @@ pub use dataset::colmap::{
     ColmapCamera, ColmapImage, ColmapModel, ColmapPoint, PosedImage, TrackedPoint, read_colmap_poses, write_colmap,
 };
 pub use dataset::{
-    Beside, DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, Lenses, PANORAMA_MASKS, PANORAMAS, Readout,
-    read_dataset,
+    DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, Lenses, PANORAMA_MASKS, PANORAMAS, Readout,
+    SiblingFolder, read_dataset,
 };
 pub use describe::{Description, Kind, describe, detect};
 pub use error::{FormatError, Malformed};
@@ -49,6 +49,6 @@ pub use photos::{
 pub use points_ply::{read_points_ply, write_points_ply};
 pub use splats::{
     Quality, SogDetail, SplatFile, SplatFormat, SpzVersion, WriteOptions, encode_splats, is_sog_folder, parse_splats,
-    read_splat_file, read_splats, splat_file_size, through_format, write_splats, write_splats_with,
+    read_splat_file, read_splats, round_trip, splat_file_size, write_splats, write_splats_with,
 };
 pub use tensors::{Tensor, read_tensors};

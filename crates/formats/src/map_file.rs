@@ -11,7 +11,7 @@ use std::path::PathBuf;
 
 /// Cells of a grid along its longer side: about what a network or a phone's sensor resolves, at little memory (48 KB of depths per
 /// photograph).
-const CELLS: u32 = 128;
+const CELLS_PER_SIDE: u32 = 128;
 
 /// A map on disk with the operations to apply when it is loaded.
 #[derive(Clone, Debug)]
@@ -20,7 +20,7 @@ pub(crate) struct MapFile {
     /// Orientation of the photograph.
     pub orientation: Orientation,
     /// Size of the upright photograph.
-    pub upright: (u32, u32),
+    pub upright_size: (u32, u32),
     /// Undistortion of the photograph, without a rotation: depths along +Z and normals keep their values.
     pub undistortion: Option<Undistortion>,
 }
@@ -31,7 +31,7 @@ type Values<T> = (u32, u32, Vec<T>);
 impl GridSource<f32> for MapFile {
     fn load(&self) -> Result<Grid<f32>, LoadError> {
         let values = self.depths().map_err(|error| LoadError(error.to_string()))?;
-        let mut grid = self.sampled(values, 0.0);
+        let mut grid = self.sample_grid(values, 0.0);
         grid.values
             .iter_mut()
             .filter(|value| !value.is_finite())
@@ -43,25 +43,25 @@ impl GridSource<f32> for MapFile {
 impl GridSource<[f32; 3]> for MapFile {
     fn load(&self) -> Result<Grid<[f32; 3]>, LoadError> {
         let values = self.normals().map_err(|error| LoadError(error.to_string()))?;
-        Ok(self.sampled(values, [0.0; 3]))
+        Ok(self.sample_grid(values, [0.0; 3]))
     }
 }
 
 impl MapFile {
     /// The map as a grid over the photograph as it is trained on; `unknown` where the map has no value.
-    fn sampled<T: Copy>(&self, (width, height, values): Values<T>, unknown: T) -> Grid<T> {
-        let shown = self.undistortion.map_or(self.upright, |plan| {
+    fn sample_grid<T: Copy>(&self, (width, height, values): Values<T>, unknown: T) -> Grid<T> {
+        let size = self.undistortion.map_or(self.upright_size, |plan| {
             let pinhole = plan.pinhole();
             (pinhole.width, pinhole.height)
         });
-        let cell = (f64::from(shown.0.max(shown.1)) / f64::from(CELLS)).max(1.0);
-        let [columns, rows] = [shown.0, shown.1].map(|side| ((f64::from(side) / cell).round() as u32).max(1));
+        let cell = (f64::from(size.0.max(size.1)) / f64::from(CELLS_PER_SIDE)).max(1.0);
+        let [columns, rows] = [size.0, size.1].map(|side| ((f64::from(side) / cell).round() as u32).max(1));
         let value = |row: u32, column: u32| {
             let x = (f64::from(column) + 0.5) / f64::from(columns);
             let y = (f64::from(row) + 0.5) / f64::from(rows);
             let [x, y] = match &self.undistortion {
                 None => [x, y],
-                Some(plan) => plan.place_in_photograph([x, y])?,
+                Some(plan) => plan.position_in_photo([x, y])?,
             };
             // The nearest value: a mean across an edge is the depth of neither side.
             let index = |at: f64, side: u32| ((at * f64::from(side)) as usize).min(side as usize - 1);
@@ -87,13 +87,13 @@ impl MapFile {
             let values = table.values.iter().map(|value| *value as f32).collect();
             return Ok((table.columns as u32, table.rows as u32, values));
         }
-        let orientation = read_header(&self.path)?.turned_with(self.orientation, self.upright);
+        let orientation = read_header(&self.path)?.orientation_from_photo(self.orientation, self.upright_size);
         decode_values(&self.path, orientation)
     }
 
     /// The normals. The file must be upright: if its pixels had to be rotated, so would the axes of its normals.
     fn normals(&self) -> Result<Values<[f32; 3]>, FormatError> {
-        if !read_header(&self.path)?.lies_as(self.upright) {
+        if !read_header(&self.path)?.has_aspect_of(self.upright_size) {
             let message = "is not upright like its photograph; create it again from the upright photograph";
             return Err(FormatError::malformed(&self.path, message));
         }
@@ -111,7 +111,7 @@ mod tests {
         MapFile {
             path,
             orientation: Orientation::NoTransforms,
-            upright: (40, 20),
+            upright_size: (40, 20),
             undistortion: None,
         }
     }
@@ -205,7 +205,7 @@ mod tests {
         write_png_16(&path, 200, 100, &(0..200 * 100).map(column).collect::<Vec<_>>()).unwrap();
         let plan = Undistortion::plan(&bent).unwrap();
         let grid = MapFile {
-            upright: (200, 100),
+            upright_size: (200, 100),
             undistortion: Some(plan),
             ..file(path)
         };
@@ -214,7 +214,7 @@ mod tests {
             let x = (f64::from(column) + 0.5) / f64::from(grid.columns);
             let row = grid.rows / 2;
             let y = (f64::from(row) + 0.5) / f64::from(grid.rows);
-            let [place, _] = plan.place_in_photograph([x, y]).unwrap();
+            let [place, _] = plan.position_in_photo([x, y]).unwrap();
             let got = f64::from(grid.values[(row * grid.columns + column) as usize]);
             assert!((got - 100.0 - 200.0 * place).abs() <= 1.0, "{x}: {got}");
         }

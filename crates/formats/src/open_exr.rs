@@ -13,9 +13,9 @@ use std::io::{BufRead, Read, Seek, SeekFrom};
 /// Maximum number of pixels, above the largest renders and sensors; a damaged file may declare any size.
 const MAX_PIXELS: usize = 1 << 28;
 /// Maximum number of decoded bytes per byte of a file, more than the best compression achieves (of a single colour, about 1,000 to one).
-const DECODED_PER_BYTE: u64 = 4096;
+const MAX_DECODED_PER_BYTE: u64 = 4096;
 /// Last parts of the names of channels that hold depths, in order of preference.
-const DEPTHS: [&str; 5] = ["Z", "Depth", "V", "Y", "R"];
+const DEPTH_CHANNELS: [&str; 5] = ["Z", "Depth", "V", "Y", "R"];
 
 /// A file whose header has been read, but not its pixels.
 pub(crate) struct ExrDecoder<R> {
@@ -53,24 +53,24 @@ impl<R: BufRead + Seek> ExrDecoder<R> {
     pub fn read_depths(self) -> ImageResult<Option<(u32, u32, Plane)>> {
         let size = self.size.map(|side| side as u32);
         let mut channels = self.read_channels().map_err(undecodable)?;
-        let named = DEPTHS.iter().find_map(|name| channels.position(&[name]));
-        let Some(at) = named.or((channels.of.len() == 1).then_some(0)) else {
+        let named = DEPTH_CHANNELS.iter().find_map(|name| channels.position(&[name]));
+        let Some(at) = named.or((channels.planes.len() == 1).then_some(0)) else {
             return Ok(None);
         };
         let is_color = channels
             .colors()
-            .is_some_and(|rgb| rgb.contains(&at) && rgb.iter().any(|c| channels.of[*c].1 != channels.of[at].1));
-        Ok((!is_color).then(|| (size[0], size[1], channels.of.swap_remove(at).1)))
+            .is_some_and(|rgb| rgb.contains(&at) && rgb.iter().any(|c| channels.planes[*c].1 != channels.planes[at].1));
+        Ok((!is_color).then(|| (size[0], size[1], channels.planes.swap_remove(at).1)))
     }
 
     /// Three channels as they are stored. `None` if there are not three.
     pub fn read_vectors(self) -> ImageResult<Option<Vectors>> {
         let size = self.size.map(|side| side as u32);
         let channels = self.read_channels().map_err(undecodable)?;
-        let Some(three) = channels.colors().or_else(|| channels.three(["X", "Y", "Z"])) else {
+        let Some(positions) = channels.colors().or_else(|| channels.find_in_layer(["X", "Y", "Z"])) else {
             return Ok(None);
         };
-        let planes = three.map(|at| &channels.of[at].1);
+        let planes = positions.map(|at| &channels.planes[at].1);
         let vector = |i: usize| planes.map(|plane| plane[i]);
         Ok(Some((size[0], size[1], (0..planes[0].len()).map(vector).collect())))
     }
@@ -93,12 +93,12 @@ impl<R: BufRead + Seek> ExrDecoder<R> {
             is_whole.then(|| {
                 (
                     channel.name.to_string(),
-                    placed(&channel.sample_data, size, offset, self.size),
+                    placed_in_image(&channel.sample_data, size, offset, self.size),
                 )
             })
         };
         Ok(Channels {
-            of: layer.channel_data.list.into_iter().filter_map(place).collect(),
+            planes: layer.channel_data.list.into_iter().filter_map(place).collect(),
         })
     }
 }
@@ -130,13 +130,13 @@ fn read_header(source: &mut (impl BufRead + Seek)) -> Result<([usize; 2], bool),
     let area = |size: Vec2<usize>| size.0.saturating_mul(size.1);
     let pixels = area(header.layer_size).max(width.saturating_mul(height));
     let decoded = (pixels as u64).saturating_mul(header.channels.bytes_per_pixel as u64);
-    if pixels > MAX_PIXELS || width.min(height) == 0 || decoded / DECODED_PER_BYTE > end {
+    if pixels > MAX_PIXELS || width.min(height) == 0 || decoded / MAX_DECODED_PER_BYTE > end {
         return Err(Error::NotSupported(
             format!("{width}x{height} pixels in {end} bytes").into(),
         ));
     }
     let channels = Channels {
-        of: header
+        planes: header
             .channels
             .list
             .iter()
@@ -147,7 +147,7 @@ fn read_header(source: &mut (impl BufRead + Seek)) -> Result<([usize; 2], bool),
 }
 
 /// The samples of a layer of `size` pixels at `offset`, placed in an image of `to` pixels; zero outside the layer.
-fn placed(samples: &FlatSamples, size: Vec2<usize>, offset: Vec2<i32>, to: [usize; 2]) -> Plane {
+fn placed_in_image(samples: &FlatSamples, size: Vec2<usize>, offset: Vec2<i32>, to: [usize; 2]) -> Plane {
     let values: Plane = samples.values_as_f32().collect();
     if (size, offset) == (Vec2(to[0], to[1]), Vec2(0, 0)) {
         return values;
@@ -169,28 +169,30 @@ fn placed(samples: &FlatSamples, size: Vec2<usize>, offset: Vec2<i32>, to: [usiz
 
 /// Channels by name. The part of a name after the last dot is the channel's own name; the part before it is its layer's.
 struct Channels {
-    of: Vec<(String, Plane)>,
+    planes: Vec<(String, Plane)>,
 }
 
 impl Channels {
     /// The first channel whose own name is one of `names`.
     fn position(&self, names: &[&str]) -> Option<usize> {
-        let is_one = |name: &str| {
-            names
-                .iter()
-                .any(|one| name.rsplit('.').next().is_some_and(|own| own.eq_ignore_ascii_case(one)))
+        let is_named = |name: &str| {
+            names.iter().any(|wanted| {
+                name.rsplit('.')
+                    .next()
+                    .is_some_and(|own| own.eq_ignore_ascii_case(wanted))
+            })
         };
-        self.of.iter().position(|(name, _)| is_one(name))
+        self.planes.iter().position(|(name, _)| is_named(name))
     }
 
     /// The channels with these names in one layer.
-    fn three(&self, names: [&str; 3]) -> Option<[usize; 3]> {
-        self.of.iter().find_map(|(name, _)| {
+    fn find_in_layer(&self, names: [&str; 3]) -> Option<[usize; 3]> {
+        self.planes.iter().find_map(|(name, _)| {
             let layer = name
                 .strip_suffix(names[0])
                 .filter(|layer| layer.is_empty() || layer.ends_with('.'))?;
             let at = |own: &str| {
-                self.of
+                self.planes
                     .iter()
                     .position(|(name, _)| name.strip_prefix(layer) == Some(own))
             };
@@ -201,19 +203,19 @@ impl Channels {
 
     /// Red, green and blue.
     fn colors(&self) -> Option<[usize; 3]> {
-        self.three(["R", "G", "B"])
+        self.find_in_layer(["R", "G", "B"])
     }
 
     /// The alpha of the colours' layer.
     fn alpha(&self) -> Option<usize> {
-        let red = &self.of[self.colors()?[0]].0;
+        let red = &self.planes[self.colors()?[0]].0;
         let alpha = format!("{}A", &red[..red.len() - 1]);
-        self.of.iter().position(|(name, _)| *name == alpha)
+        self.planes.iter().position(|(name, _)| *name == alpha)
     }
 }
 
 /// The 8-bit sRGB value of a linear one; values above 1 are white.
-fn byte(linear: f32) -> u8 {
+fn srgb_byte(linear: f32) -> u8 {
     // NaN becomes zero in the conversion.
     (255.0 * srgb_from_linear(linear.clamp(0.0, 1.0))).round() as u8
 }
@@ -238,7 +240,7 @@ impl<R: BufRead + Seek> ImageDecoder for ExrDecoder<R> {
         let grey = || {
             channels
                 .position(&["Y", "R"])
-                .or((channels.of.len() == 1).then_some(0))
+                .or((channels.planes.len() == 1).then_some(0))
                 .map(|at| [at; 3])
         };
         let rgb = channels
@@ -248,12 +250,12 @@ impl<R: BufRead + Seek> ImageDecoder for ExrDecoder<R> {
         let alpha = channels.alpha().filter(|_| has_alpha);
         let count = if has_alpha { 4 } else { 3 };
         for (i, to) in out.chunks_exact_mut(count).enumerate() {
-            let covered = alpha.map_or(1.0, |at| channels.of[at].1[i]);
+            let coverage = alpha.map_or(1.0, |at| channels.planes[at].1[i]);
             for (to, at) in to.iter_mut().zip(rgb) {
-                *to = byte(channels.of[at].1[i] / if covered > 0.0 { covered } else { 1.0 });
+                *to = srgb_byte(channels.planes[at].1[i] / if coverage > 0.0 { coverage } else { 1.0 });
             }
             if has_alpha {
-                to[3] = (255.0 * covered.clamp(0.0, 1.0)).round() as u8;
+                to[3] = (255.0 * coverage.clamp(0.0, 1.0)).round() as u8;
             }
         }
         Ok(())

@@ -1,14 +1,14 @@
 use crate::DEFAULT_MAX_SIDE;
-use crate::image_file::{Colour, decode, decode_jpeg_at, decode_mask, read_header};
-use crate::shown::Shown;
+use crate::image_file::{Colour, decode, decode_jpeg_scaled, decode_mask, read_header};
 use crate::undistort::Undistortion;
+use crate::valid_region::ValidRegion;
 use crate::{FormatError, Pixels};
 use image::metadata::Orientation;
 use irradia_scene::{LoadError, Part, Photo, PhotoSource, resize_area, resize_part};
 use std::path::{Path, PathBuf};
 
 /// Minimum mask value of pixels that are included in training.
-const MASK_THRESHOLD: u8 = 128;
+pub(crate) const MASK_THRESHOLD: u8 = 128;
 
 /// A photograph on disk with the operations to apply when it is loaded.
 #[derive(Clone, Debug)]
@@ -20,10 +20,10 @@ pub(crate) struct PhotoFile {
     /// Whether `image` is a JPEG.
     pub jpeg: bool,
     /// Size after orientation, from the header when the dataset was read.
-    pub upright: (u32, u32),
+    pub upright_size: (u32, u32),
     pub undistortion: Option<Undistortion>,
     /// The usable part of a photograph that is not undistorted; `None` if all of it is usable.
-    pub shown: Option<Shown>,
+    pub valid_region: Option<ValidRegion>,
     /// Size of the resulting photograph.
     pub size: (u32, u32),
     /// Whether alpha counts even if all of it is opaque, as in rendered scenes. Otherwise such a photograph is one without alpha: programs
@@ -49,7 +49,7 @@ impl PhotoSource for PhotoFile {
 
     fn working_bytes(&self) -> usize {
         let divisor = self.divisor(self.size) as usize;
-        let pixels = self.upright.0 as usize * self.upright.1 as usize / (divisor * divisor);
+        let pixels = self.upright_size.0 as usize * self.upright_size.1 as usize / (divisor * divisor);
         // The file, the decoded pixels with their planes, and the undistorted pixels.
         10 * pixels
     }
@@ -59,17 +59,18 @@ impl PhotoFile {
     /// The divisor of both sides at which the file is decoded for a photograph of `size`: more than 1 only for JPEG above
     /// [`DEFAULT_MAX_SIDE`], to save time. It depends on sizes alone.
     fn divisor(&self, size: (u32, u32)) -> u32 {
-        if !self.jpeg || self.upright.0.max(self.upright.1) <= DEFAULT_MAX_SIDE {
+        if !self.jpeg || self.upright_size.0.max(self.upright_size.1) <= DEFAULT_MAX_SIDE {
             return 1;
         }
-        let (width, height) = self.undistortion.map_or(self.upright, |plan| {
+        let (width, height) = self.undistortion.map_or(self.upright_size, |plan| {
             let pinhole = plan.pinhole();
             (pinhole.width, pinhole.height)
         });
         let wraps = self.undistortion.is_some_and(|plan| plan.wraps());
-        let joins = |divisor: &u32| !wraps || self.upright.0.is_multiple_of(*divisor);
-        let suffices = |divisor: &u32| joins(divisor) && width / divisor >= size.0 && height / divisor >= size.1;
-        [8, 4, 2].into_iter().find(suffices).unwrap_or(1)
+        let keeps_seam = |divisor: &u32| !wraps || self.upright_size.0.is_multiple_of(*divisor);
+        let is_sufficient =
+            |divisor: &u32| keeps_seam(divisor) && width / divisor >= size.0 && height / divisor >= size.1;
+        [8, 4, 2].into_iter().find(is_sufficient).unwrap_or(1)
     }
 
     /// The photograph at `size`.
@@ -78,9 +79,9 @@ impl PhotoFile {
         let pixels = if divisor == 1 {
             decode(&self.image, self.orientation, Colour::Keep)?
         } else {
-            decode_jpeg_at(&self.image, divisor, self.orientation)?
+            decode_jpeg_scaled(&self.image, divisor, self.orientation)?
         };
-        let (width, height) = self.upright;
+        let (width, height) = self.upright_size;
         if (pixels.width, pixels.height) != (width.div_ceil(divisor), height.div_ceil(divisor)) {
             return Err(FormatError::malformed(
                 &self.image,
@@ -95,14 +96,14 @@ impl PhotoFile {
             true => pixels.without_alpha(),
             false => pixels,
         };
-        let pixels = self.bring_to_size(pixels, self.part(divisor), size);
+        let pixels = self.undistort_and_resize(pixels, self.part(divisor), size);
         let mut mask = self
             .mask
             .as_deref()
             .map(|path| self.read_mask(path, size))
             .transpose()?;
-        if let Some(shown) = &self.shown {
-            shown.restrict(size.0, size.1, &mut mask);
+        if let Some(region) = &self.valid_region {
+            region.restrict_mask(size.0, size.1, &mut mask);
         }
         Ok(Photo {
             width: pixels.width,
@@ -116,18 +117,18 @@ impl PhotoFile {
     /// Where the photograph lies in the file decoded at 1 / `divisor` of its size: if the divisor does not divide the sides, pixels at
     /// the right and the lower edge of the file lie partly beyond the photograph.
     fn part(&self, divisor: u32) -> Part {
-        let size = [self.upright.0, self.upright.1].map(|side| f64::from(side) / f64::from(divisor));
-        let beyond = size.map(|side| side.ceil() - side);
+        let size = [self.upright_size.0, self.upright_size.1].map(|side| f64::from(side) / f64::from(divisor));
+        let padding = size.map(|side| side.ceil() - side);
         use Orientation::{FlipHorizontal, FlipVertical, Rotate90, Rotate180, Rotate270, Rotate270FlipH};
         let flipped = [
             matches!(self.orientation, Rotate90 | Rotate180 | FlipHorizontal | Rotate270FlipH),
             matches!(self.orientation, Rotate180 | Rotate270 | FlipVertical | Rotate270FlipH),
         ];
-        let start = [0, 1].map(|axis| if flipped[axis] { beyond[axis] } else { 0.0 });
+        let start = [0, 1].map(|axis| if flipped[axis] { padding[axis] } else { 0.0 });
         Part { start, size }
     }
 
-    fn bring_to_size(&self, mut pixels: Pixels, mut part: Part, size: (u32, u32)) -> Pixels {
+    fn undistort_and_resize(&self, mut pixels: Pixels, mut part: Part, size: (u32, u32)) -> Pixels {
         if let Some(undistortion) = &self.undistortion {
             pixels = undistortion.apply_to_part(&pixels, part);
             part = Part::whole([pixels.width, pixels.height]);
@@ -142,14 +143,14 @@ impl PhotoFile {
     }
 
     fn read_mask(&self, path: &Path, size: (u32, u32)) -> Result<Vec<u8>, FormatError> {
-        let orientation = read_header(path)?.turned_with(self.orientation, self.upright);
+        let orientation = read_header(path)?.orientation_from_photo(self.orientation, self.upright_size);
         let mut mask = decode_mask(path, orientation)?;
-        let upright = [self.upright.0, self.upright.1];
+        let upright = [self.upright_size.0, self.upright_size.1];
         if [mask.width, mask.height] != upright {
             mask.data = resize_area(&mask.data, mask.channels, [mask.width, mask.height], upright);
             [mask.width, mask.height] = upright;
         }
-        let mut mask = self.bring_to_size(mask, Part::whole(upright), size).data;
+        let mut mask = self.undistort_and_resize(mask, Part::whole(upright), size).data;
         mask.iter_mut()
             .for_each(|v| *v = if *v >= MASK_THRESHOLD { 255 } else { 0 });
         Ok(mask)
@@ -182,9 +183,9 @@ mod tests {
                 mask: None,
                 orientation: Orientation::NoTransforms,
                 jpeg,
-                upright: (2000, 1400),
+                upright_size: (2000, 1400),
                 undistortion,
-                shown: None,
+                valid_region: None,
                 size: (960, 672),
                 keeps_alpha: false,
             };
@@ -243,9 +244,9 @@ mod tests {
                     mask: None,
                     orientation,
                     jpeg,
-                    upright,
+                    upright_size: upright,
                     undistortion,
-                    shown: None,
+                    valid_region: None,
                     size: (upright.0 / 9, upright.1 / 9),
                     keeps_alpha: false,
                 };
@@ -271,9 +272,9 @@ mod tests {
                 mask: None,
                 orientation: Orientation::NoTransforms,
                 jpeg: false,
-                upright: (2, 1),
+                upright_size: (2, 1),
                 undistortion: None,
-                shown: None,
+                valid_region: None,
                 size: (2, 1),
                 keeps_alpha,
             };

@@ -5,7 +5,7 @@ use irradia_scene::Scalar;
 use std::borrow::Cow;
 
 /// A header is a few kilobytes; a file without `end_header` is not searched to its end.
-const MAX_HEADER: usize = 1 << 20;
+const MAX_HEADER_BYTES: usize = 1 << 20;
 
 /// The type that has this name in a header.
 fn scalar_of(name: &str) -> Option<Scalar> {
@@ -45,7 +45,7 @@ enum Encoding {
 
 #[derive(Clone, Copy, Debug)]
 enum PropertyKind {
-    One(Scalar),
+    Scalar(Scalar),
     List { count: Scalar, item: Scalar },
 }
 
@@ -66,19 +66,19 @@ impl Element {
     /// Bytes of a binary row if no property is a list.
     fn fixed_stride(&self) -> Option<usize> {
         self.properties.iter().try_fold(0, |sum, property| match property.kind {
-            PropertyKind::One(scalar) => Some(sum + scalar.size()),
+            PropertyKind::Scalar(scalar) => Some(sum + scalar.size()),
             PropertyKind::List { .. } => None,
         })
     }
 
     /// Minimum length of a row: bytes (binary) or characters (ASCII, a digit and a separator per value).
-    fn min_row(&self, encoding: Encoding) -> u64 {
-        let least = |property: &Property| match (encoding, property.kind) {
+    fn min_row_size(&self, encoding: Encoding) -> u64 {
+        let min_size = |property: &Property| match (encoding, property.kind) {
             (Encoding::Ascii, _) => 2,
-            (_, PropertyKind::One(scalar)) => scalar.size(),
+            (_, PropertyKind::Scalar(scalar)) => scalar.size(),
             (_, PropertyKind::List { count, .. }) => count.size(),
         };
-        self.properties.iter().map(least).sum::<usize>() as u64
+        self.properties.iter().map(min_size).sum::<usize>() as u64
     }
 }
 
@@ -115,12 +115,12 @@ impl<'a> Ply<'a> {
         let mut comments = Vec::new();
         let mut elements: Vec<Element> = Vec::new();
         loop {
-            let Some(line) = next_line(&mut rest).filter(|_| bytes.len() - rest.len() <= MAX_HEADER) else {
+            let Some(line) = next_line(&mut rest).filter(|_| bytes.len() - rest.len() <= MAX_HEADER_BYTES) else {
                 return Err(Malformed(
                     "the PLY header has no `end_header`; the file is damaged".into(),
                 ));
             };
-            let refuse = || Malformed(format!("the PLY header line `{}` is not understood", shown(line)));
+            let invalid_line = || Malformed(format!("the PLY header line `{}` is not understood", excerpt(line)));
             let words: Vec<&str> = line.split_ascii_whitespace().collect();
             match words[..] {
                 ["end_header"] => break,
@@ -130,31 +130,31 @@ impl<'a> Ply<'a> {
                         "ascii" => Encoding::Ascii,
                         "binary_little_endian" => Encoding::LittleEndian,
                         "binary_big_endian" => Encoding::BigEndian,
-                        _ => return Err(refuse()),
+                        _ => return Err(invalid_line()),
                     });
                 }
                 ["element", name, count] => elements.push(Element {
                     name: name.to_owned(),
-                    count: count.parse().map_err(|_| refuse())?,
+                    count: count.parse().map_err(|_| invalid_line())?,
                     properties: Vec::new(),
                 }),
                 ["property", "list", count, item, name] => {
-                    let count = scalar_of(count).filter(|c| !c.is_float()).ok_or_else(refuse)?;
-                    let item = scalar_of(item).ok_or_else(refuse)?;
-                    elements.last_mut().ok_or_else(refuse)?.properties.push(Property {
+                    let count = scalar_of(count).filter(|c| !c.is_float()).ok_or_else(invalid_line)?;
+                    let item = scalar_of(item).ok_or_else(invalid_line)?;
+                    elements.last_mut().ok_or_else(invalid_line)?.properties.push(Property {
                         name: name.to_owned(),
                         kind: PropertyKind::List { count, item },
                     });
                 }
                 ["property", scalar, name] => {
-                    let scalar = scalar_of(scalar).ok_or_else(refuse)?;
-                    elements.last_mut().ok_or_else(refuse)?.properties.push(Property {
+                    let scalar = scalar_of(scalar).ok_or_else(invalid_line)?;
+                    elements.last_mut().ok_or_else(invalid_line)?.properties.push(Property {
                         name: name.to_owned(),
-                        kind: PropertyKind::One(scalar),
+                        kind: PropertyKind::Scalar(scalar),
                     });
                 }
                 [] => {}
-                _ => return Err(refuse()),
+                _ => return Err(invalid_line()),
             }
         }
         Ok(Self {
@@ -196,9 +196,9 @@ impl<'a> Ply<'a> {
         for before in before.filter(|e| !e.properties.is_empty()) {
             self.check_size(before, rest)?;
             match (self.encoding, before.fixed_stride()) {
-                (Encoding::Ascii, _) => walk_ascii(before, &mut rest, None)?,
+                (Encoding::Ascii, _) => scan_ascii(before, &mut rest, None)?,
                 (_, Some(stride)) => rest = &rest[before.count as usize * stride..],
-                (_, None) => self.walk_binary(before, &mut rest, None)?,
+                (_, None) => self.scan_binary(before, &mut rest, None)?,
             }
         }
         if wanted.properties.is_empty() {
@@ -210,7 +210,7 @@ impl<'a> Ply<'a> {
         let mut stride = 0;
         let big_endian = self.encoding == Encoding::BigEndian;
         for property in &wanted.properties {
-            if let PropertyKind::One(scalar) = property.kind {
+            if let PropertyKind::Scalar(scalar) = property.kind {
                 let column = Column {
                     offset: stride,
                     scalar,
@@ -223,13 +223,13 @@ impl<'a> Ply<'a> {
         let bytes = match (self.encoding, wanted.fixed_stride()) {
             (Encoding::Ascii, _) => {
                 let mut packed = Vec::new();
-                walk_ascii(wanted, &mut rest, Some(&mut packed))?;
+                scan_ascii(wanted, &mut rest, Some(&mut packed))?;
                 Cow::Owned(packed)
             }
             (_, Some(stride)) => Cow::Borrowed(&rest[..count * stride]),
             (_, None) => {
                 let mut packed = Vec::new();
-                self.walk_binary(wanted, &mut rest, Some(&mut packed))?;
+                self.scan_binary(wanted, &mut rest, Some(&mut packed))?;
                 Cow::Owned(packed)
             }
         };
@@ -238,9 +238,9 @@ impl<'a> Ply<'a> {
 
     fn check_size(&self, element: &Element, rest: &[u8]) -> Result<(), Malformed> {
         // The last number of an ASCII file needs no separator.
-        let there = rest.len() as u64 + u64::from(self.encoding == Encoding::Ascii);
-        let needed = u128::from(element.count) * u128::from(element.min_row(self.encoding));
-        if needed > u128::from(there) {
+        let available = rest.len() as u64 + u64::from(self.encoding == Encoding::Ascii);
+        let needed = u128::from(element.count) * u128::from(element.min_row_size(self.encoding));
+        if needed > u128::from(available) {
             return Err(Malformed(format!(
                 "the PLY header declares {} rows of `{}`, which take at least {needed} bytes, and the file has {} left; \
                  it is truncated, copy it again",
@@ -252,21 +252,21 @@ impl<'a> Ply<'a> {
         Ok(())
     }
 
-    fn walk_binary(
+    fn scan_binary(
         &self,
         element: &Element,
         rest: &mut &[u8],
         mut packed: Option<&mut Vec<u8>>,
     ) -> Result<(), Malformed> {
         let mut take = |count: usize| -> Result<&[u8], Malformed> {
-            let (taken, left) = rest.split_at_checked(count).ok_or_else(|| ends_within(element))?;
+            let (taken, left) = rest.split_at_checked(count).ok_or_else(|| truncated(element))?;
             *rest = left;
             Ok(taken)
         };
         for _ in 0..element.count {
             for property in &element.properties {
                 match property.kind {
-                    PropertyKind::One(scalar) => {
+                    PropertyKind::Scalar(scalar) => {
                         let taken = take(scalar.size())?;
                         if let Some(packed) = packed.as_deref_mut() {
                             packed.extend_from_slice(taken);
@@ -368,14 +368,14 @@ impl Column {
     }
 }
 
-fn walk_ascii(element: &Element, rest: &mut &[u8], mut packed: Option<&mut Vec<u8>>) -> Result<(), Malformed> {
+fn scan_ascii(element: &Element, rest: &mut &[u8], mut packed: Option<&mut Vec<u8>>) -> Result<(), Malformed> {
     let mut next = || -> Result<&str, Malformed> {
         let text = rest.trim_ascii_start();
         let length = text.iter().position(u8::is_ascii_whitespace).unwrap_or(text.len());
         let (word, left) = text.split_at(length);
         *rest = left;
         match std::str::from_utf8(word) {
-            Ok("") => Err(ends_within(element)),
+            Ok("") => Err(truncated(element)),
             Ok(word) => Ok(word),
             Err(_) => Err(Malformed(format!(
                 "the ASCII rows of `{}` contain something that is not a number",
@@ -386,7 +386,7 @@ fn walk_ascii(element: &Element, rest: &mut &[u8], mut packed: Option<&mut Vec<u
     for _ in 0..element.count {
         for property in &element.properties {
             match property.kind {
-                PropertyKind::One(scalar) => {
+                PropertyKind::Scalar(scalar) => {
                     let word = next()?;
                     if let Some(packed) = packed.as_deref_mut() {
                         push_number(packed, scalar, word)?;
@@ -427,21 +427,21 @@ fn push_number(packed: &mut Vec<u8>, scalar: Scalar, word: &str) -> Result<(), M
 }
 
 fn next_line<'a>(rest: &mut &'a [u8]) -> Option<&'a str> {
-    let end = rest.iter().take(MAX_HEADER).position(|byte| *byte == b'\n')?;
+    let end = rest.iter().take(MAX_HEADER_BYTES).position(|byte| *byte == b'\n')?;
     let line = std::str::from_utf8(&rest[..end]).ok()?;
     *rest = &rest[end + 1..];
     Some(line.trim_end())
 }
 
-fn shown(text: &str) -> String {
+fn excerpt(text: &str) -> String {
     text.chars().take(60).filter(|c| !c.is_control()).collect()
 }
 
 fn not_a_number(word: &str) -> Malformed {
-    Malformed(format!("`{}` is not a number", shown(word)))
+    Malformed(format!("`{}` is not a number", excerpt(word)))
 }
 
-fn ends_within(element: &Element) -> Malformed {
+fn truncated(element: &Element) -> Malformed {
     Malformed(format!(
         "ends within the {} rows of `{}` that the header declares; the file is truncated, copy it again",
         element.count, element.name

@@ -85,8 +85,8 @@ pub(crate) fn encode_points(points: &PointCloud) -> Vec<u8> {
 fn color_scale(rows: &Rows, columns: [Column; 3]) -> f64 {
     match columns[0].scalar {
         scalar if scalar.is_float() => {
-            let over_one = (0..rows.len()).any(|index| columns.iter().any(|c| c.f64(rows.row(index)) > 1.0));
-            if over_one { 1.0 } else { 255.0 }
+            let exceeds_one = (0..rows.len()).any(|index| columns.iter().any(|c| c.f64(rows.row(index)) > 1.0));
+            if exceeds_one { 1.0 } else { 255.0 }
         }
         scalar if scalar.size() == 2 => 255.0 / 65535.0,
         _ => 1.0,

@@ -8,12 +8,12 @@ use std::sync::LazyLock;
 
 /// Spacing of the grid on which the lens is evaluated, pixels; in between, it is interpolated. The error is the second
 /// derivative of the mapping times 8, a few thousandths of a pixel for photographic lenses.
-const GRID: u32 = 8;
+const GRID_SPACING: u32 = 8;
 /// Maximum size of an undistorted image relative to the photograph (COLMAP's `max_scale`); a fisheye's rim would otherwise
 /// stretch to infinity.
-const LARGEST: f64 = 2.0;
+const MAX_SCALE: f64 = 2.0;
 /// Minimum side of a crop, pixels.
-const SMALLEST: i64 = 16;
+const MIN_CROP_SIDE: i64 = 16;
 
 /// The mapping from the photographs of one camera to pinhole images.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -23,7 +23,7 @@ pub(crate) struct Undistortion {
     /// The camera of the results.
     pinhole: Intrinsics,
     /// Rotation from the results' axes to the photographs'.
-    turn: DQuat,
+    rotation: DQuat,
     interpolation: Interpolation,
 }
 
@@ -41,7 +41,7 @@ impl Undistortion {
     /// The pinhole with the source's axes and focal lengths, cropped to the largest upright rectangle in which every pixel lies
     /// in the photograph; `None` when there is no such rectangle.
     pub fn plan(source: &Intrinsics) -> Option<Self> {
-        let half = DVec2::new(f64::from(source.width), f64::from(source.height)) * (0.5 * LARGEST);
+        let half = DVec2::new(f64::from(source.width), f64::from(source.height)) * (0.5 * MAX_SCALE);
         let (cx, cy) = (f64::from(source.cx), f64::from(source.cy));
         let largest = Crop {
             left: (cx - half.x) as i64,
@@ -50,31 +50,31 @@ impl Undistortion {
             bottom: (cy + half.y) as i64,
         };
         let largest_radius = (half.x / f64::from(source.fx)).hypot(half.y / f64::from(source.fy));
-        let reach = source.lens.reach_on_plane(largest_radius);
+        let max_radius = source.lens.reach_on_plane(largest_radius);
         let whole = Self {
             source: *source,
             pinhole: Intrinsics {
                 lens: Lens::Pinhole,
                 ..*source
             },
-            turn: DQuat::IDENTITY,
+            rotation: DQuat::IDENTITY,
             interpolation: Interpolation::Bilinear,
         };
-        whole.cropped(largest, |p| p.length() < reach)
+        whole.cropped(largest, |p| p.length() < max_radius)
     }
 
-    /// The image of `pinhole` rotated by `turn` (from its axes to the photographs'), cropped as by [`Undistortion::plan`] to the
+    /// The image of `pinhole` rotated by `rotation` (from its axes to the photographs'), cropped as by [`Undistortion::plan`] to the
     /// directions, in the photographs' axes, for which `shows` is true.
-    pub fn turned(
+    pub fn rotated(
         source: &Intrinsics,
         pinhole: Intrinsics,
-        turn: DQuat,
+        rotation: DQuat,
         shows: impl Fn(DVec3) -> bool,
     ) -> Option<Self> {
         let whole = Self {
             source: *source,
             pinhole,
-            turn,
+            rotation,
             interpolation: Interpolation::Lanczos,
         };
         let largest = Crop {
@@ -83,26 +83,26 @@ impl Undistortion {
             right: i64::from(pinhole.width),
             bottom: i64::from(pinhole.height),
         };
-        whole.cropped(largest, |p| shows(turn * p.extend(1.0)))
+        whole.cropped(largest, |p| shows(rotation * p.extend(1.0)))
     }
 
-    /// `self` cropped within `largest` (in pixels of its image) so that every pixel lies in the photograph and `shown` is true for
+    /// `self` cropped within `largest` (in pixels of its image) so that every pixel lies in the photograph and `is_shown` is true for
     /// every point of the undistorted plane.
     ///
     /// The rectangle is found by peeling: starting from a box that is certainly too large, the side with the largest fraction
     /// outside is moved in until all four sides are inside. The valid region has no holes, so the interior is valid, too.
-    fn cropped(self, largest: Crop, shown: impl Fn(DVec2) -> bool) -> Option<Self> {
-        let valid = |x: f64, y: f64| shown(self.pinhole.plane_of(DVec2::new(x, y))) && self.is_in_photograph(x, y);
+    fn cropped(self, largest: Crop, is_shown: impl Fn(DVec2) -> bool) -> Option<Self> {
+        let valid = |x: f64, y: f64| is_shown(self.pinhole.plane_of(DVec2::new(x, y))) && self.is_in_photograph(x, y);
         let mut crop = largest;
         let step = (i64::from(self.source.width.max(self.source.height)) / 256).max(1);
         loop {
             let outside = Side::ALL.map(|side| crop.outside(side, 64, valid));
-            let worst = (0..4).max_by_key(|i| outside[*i]).expect("four sides");
-            if outside[worst] == 0 {
+            let worst_side = (0..4).max_by_key(|i| outside[*i]).expect("four sides");
+            if outside[worst_side] == 0 {
                 break;
             }
-            crop.move_in(Side::ALL[worst], step);
-            if crop.right - crop.left < SMALLEST || crop.bottom - crop.top < SMALLEST {
+            crop.shrink(Side::ALL[worst_side], step);
+            if crop.right - crop.left < MIN_CROP_SIDE || crop.bottom - crop.top < MIN_CROP_SIDE {
                 return None;
             }
         }
@@ -110,7 +110,7 @@ impl Undistortion {
         for side in Side::ALL {
             for _ in 0..step {
                 let mut larger = crop;
-                larger.move_in(side, -1);
+                larger.shrink(side, -1);
                 if !largest.contains(&larger) || Side::ALL.iter().any(|side| larger.outside(*side, 256, valid) > 0) {
                     break;
                 }
@@ -135,14 +135,14 @@ impl Undistortion {
     }
 
     /// The rotation from the results' axes to the photographs'.
-    pub fn turn(&self) -> DQuat {
-        self.turn
+    pub fn rotation(&self) -> DQuat {
+        self.rotation
     }
 
     /// Whether the results show the position `(x, y)` of the photograph, pixels.
     pub fn shows(&self, x: f64, y: f64) -> bool {
         let direction = self.source.lens.direction(self.source.plane_of(DVec2::new(x, y)));
-        let ray = direction.map(|direction| self.turn.inverse() * direction);
+        let ray = direction.map(|direction| self.rotation.inverse() * direction);
         ray.filter(|ray| ray.z > 0.0).is_some_and(|ray| {
             let k = &self.pinhole;
             let at = k.pixel_of(ray.truncate() / ray.z);
@@ -152,13 +152,13 @@ impl Undistortion {
 
     /// Position in the photograph of a position in the results, both as fractions of the sides; `None` beyond the photograph, or
     /// where the lens does not map the direction to a pixel.
-    pub fn place_in_photograph(&self, [x, y]: [f64; 2]) -> Option<[f64; 2]> {
+    pub fn position_in_photo(&self, [x, y]: [f64; 2]) -> Option<[f64; 2]> {
         let at = self.source_position(x * f64::from(self.pinhole.width), y * f64::from(self.pinhole.height))?;
-        let place = [
+        let position = [
             at.x / f64::from(self.source.width),
             at.y / f64::from(self.source.height),
         ];
-        place.iter().all(|at| (0.0..=1.0).contains(at)).then_some(place)
+        position.iter().all(|at| (0.0..=1.0).contains(at)).then_some(position)
     }
 
     /// Whether the photographs wrap around, from the right edge to the left one.
@@ -168,7 +168,7 @@ impl Undistortion {
 
     /// Position in the photograph, pixels, of a position in the results; `None` where the lens does not map the direction to a pixel.
     fn source_position(&self, x: f64, y: f64) -> Option<DVec2> {
-        let direction = self.turn * self.pinhole.plane_of(DVec2::new(x, y)).extend(1.0);
+        let direction = self.rotation * self.pinhole.plane_of(DVec2::new(x, y)).extend(1.0);
         Some(self.source.pixel_of(self.source.lens.project(direction)?))
     }
 
@@ -211,7 +211,7 @@ impl Undistortion {
         ];
         // Not interpolated for panoramas: longitudes jump behind the camera, and all meet at the poles.
         let wraps = self.wraps();
-        let grid = if wraps { 1 } else { GRID };
+        let grid = if wraps { 1 } else { GRID_SPACING };
         let grid_columns = width.div_ceil(grid) + 1;
         let grid_row = |y: u32| -> Vec<[f32; 2]> {
             (0..grid_columns)
@@ -230,10 +230,10 @@ impl Undistortion {
             let lower = grid_row(first + grid);
             for y in first..(first + grid).min(height) {
                 let t = (y - first) as f32 / grid as f32;
-                let mix = |i: usize, axis: usize| upper[i][axis] + (lower[i][axis] - upper[i][axis]) * t;
+                let lerp = |i: usize, axis: usize| upper[i][axis] + (lower[i][axis] - upper[i][axis]) * t;
                 for column in 0..grid_columns as usize - 1 {
-                    let start = [mix(column, 0), mix(column, 1)];
-                    let end = [mix(column + 1, 0), mix(column + 1, 1)];
+                    let start = [lerp(column, 0), lerp(column, 1)];
+                    let end = [lerp(column + 1, 0), lerp(column + 1, 1)];
                     let slope = [(end[0] - start[0]) / grid as f32, (end[1] - start[1]) / grid as f32];
                     for i in 0..grid.min(width - column as u32 * grid) {
                         let at = [start[0] + slope[0] * i as f32, start[1] + slope[1] * i as f32];
@@ -272,9 +272,9 @@ fn sample<const C: usize, const N: usize>(
     };
     let y = at[1].clamp(0.0, (height - 1) as f32);
     let (left, top) = (x.floor(), y.floor());
-    let before = N as isize / 2 - 1;
+    let taps_before = N as isize / 2 - 1;
     let columns: [usize; N] = std::array::from_fn(|i| {
-        let column = left as isize + i as isize - before;
+        let column = left as isize + i as isize - taps_before;
         (if wraps {
             column.rem_euclid(width)
         } else {
@@ -285,7 +285,7 @@ fn sample<const C: usize, const N: usize>(
     let mut sums = [0f32; C];
     let mut color_weight = 0.0;
     for (i, v) in v.into_iter().enumerate() {
-        let row = (top as isize + i as isize - before).clamp(0, height - 1) * width;
+        let row = (top as isize + i as isize - taps_before).clamp(0, height - 1) * width;
         for (column, u) in columns.into_iter().zip(u) {
             let start = (row as usize + column) * C;
             let pixel: &[u8; C] = from.data[start..start + C].try_into().expect("C values");
@@ -366,7 +366,7 @@ impl Crop {
         self.left <= other.left && self.top <= other.top && self.right >= other.right && self.bottom >= other.bottom
     }
 
-    fn move_in(&mut self, side: Side, by: i64) {
+    fn shrink(&mut self, side: Side, by: i64) {
         match side {
             Side::Left => self.left += by,
             Side::Top => self.top += by,

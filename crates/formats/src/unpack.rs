@@ -5,7 +5,7 @@ use flate2::read::{DeflateDecoder, GzDecoder};
 use std::io::Read;
 
 /// Maximum window of a zstd frame, bytes; the window is allocated before the first byte is decoded.
-const MAX_ZSTD_WINDOW: u64 = 128 << 20;
+const MAX_ZSTD_WINDOW_BYTES: u64 = 128 << 20;
 
 /// A gzip stream, read front to back.
 pub(crate) struct Gunzip<'a>(GzDecoder<&'a [u8]>);
@@ -17,7 +17,7 @@ impl<'a> Gunzip<'a> {
 
     /// The next `count` bytes; the caller has checked that `count` is plausible.
     pub fn take(&mut self, count: usize) -> Result<Vec<u8>, Malformed> {
-        exactly(&mut self.0, count, "gzip")
+        read_exactly(&mut self.0, count, "gzip")
     }
 
     /// Reads what follows the last value, up to 64 KiB, so that the checksum is compared.
@@ -36,17 +36,17 @@ impl<'a> Gunzip<'a> {
 
 /// A raw deflate stream of `count` bytes, as in a zip archive.
 pub(crate) fn inflate(packed: &[u8], count: usize) -> Result<Vec<u8>, Malformed> {
-    exactly(&mut DeflateDecoder::new(packed), count, "deflate")
+    read_exactly(&mut DeflateDecoder::new(packed), count, "deflate")
 }
 
 /// A zstd frame of `count` bytes.
 pub(crate) fn unzstd(packed: &[u8], count: usize) -> Result<Vec<u8>, Malformed> {
-    let decoder = ruzstd::decoding::StreamingDecoder::new_with_max_window_size(packed, MAX_ZSTD_WINDOW);
+    let decoder = ruzstd::decoding::StreamingDecoder::new_with_max_window_size(packed, MAX_ZSTD_WINDOW_BYTES);
     let mut decoder = decoder.map_err(|error| damaged("zstd", &error))?;
-    exactly(&mut decoder, count, "zstd")
+    read_exactly(&mut decoder, count, "zstd")
 }
 
-fn exactly(reader: &mut impl Read, count: usize, kind: &str) -> Result<Vec<u8>, Malformed> {
+fn read_exactly(reader: &mut impl Read, count: usize, kind: &str) -> Result<Vec<u8>, Malformed> {
     // Beyond the first 16 MiB, memory grows with what the stream holds, not with what was declared.
     let mut bytes = Vec::with_capacity(count.min(16 << 20));
     let read = reader.take(count as u64).read_to_end(&mut bytes);

@@ -4,7 +4,7 @@
 use crate::Malformed;
 
 /// Maximum nesting depth of elements; a deeper file cannot be a list of cameras.
-const DEEPEST: usize = 64;
+const MAX_DEPTH: usize = 64;
 
 /// An element with its contents.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -88,7 +88,7 @@ pub fn parse_xml(bytes: &[u8]) -> Result<Element, Malformed> {
             rest = after;
             continue;
         }
-        let end = end_of_tag(rest).ok_or_else(|| wrong("it ends within a tag"))?;
+        let end = end_of_tag(rest).ok_or_else(|| malformed("it ends within a tag"))?;
         let tag = &rest[1..end];
         rest = &rest[end + 1..];
         if let Some(name) = tag.strip_prefix('/') {
@@ -96,9 +96,9 @@ pub fn parse_xml(bytes: &[u8]) -> Result<Element, Malformed> {
                 .pop()
                 .filter(|element| element.name == name.trim() && !open.is_empty());
             let Some(element) = closed else {
-                return Err(wrong(&format!("</{}> closes nothing", name.trim())));
+                return Err(malformed(&format!("</{}> closes nothing", name.trim())));
             };
-            push(&mut open, element);
+            push_child(&mut open, element);
             continue;
         }
         let (tag, is_empty) = match tag.strip_suffix('/') {
@@ -107,9 +107,9 @@ pub fn parse_xml(bytes: &[u8]) -> Result<Element, Malformed> {
         };
         let element = start_tag(tag)?;
         if is_empty {
-            push(&mut open, element);
-        } else if open.len() > DEEPEST {
-            return Err(wrong(&format!("elements are nested more than {DEEPEST} deep")));
+            push_child(&mut open, element);
+        } else if open.len() > MAX_DEPTH {
+            return Err(malformed(&format!("elements are nested more than {MAX_DEPTH} deep")));
         } else {
             open.push(element);
         }
@@ -117,17 +117,17 @@ pub fn parse_xml(bytes: &[u8]) -> Result<Element, Malformed> {
     let mut outer = open.swap_remove(0);
     match (open.is_empty(), outer.children.is_empty()) {
         (true, false) => Ok(outer.children.swap_remove(0)),
-        (true, true) => Err(wrong("it has no element")),
-        (false, _) => Err(wrong("it ends before its elements are closed")),
+        (true, true) => Err(malformed("it has no element")),
+        (false, _) => Err(malformed("it ends before its elements are closed")),
     }
 }
 
-fn wrong(message: &str) -> Malformed {
+fn malformed(message: &str) -> Malformed {
     Malformed(format!("not usable XML: {message}"))
 }
 
 /// Adds `element` to the innermost open one.
-fn push(open: &mut [Element], element: Element) {
+fn push_child(open: &mut [Element], element: Element) {
     if let Some(parent) = open.last_mut() {
         parent.children.push(element);
     }
@@ -156,7 +156,7 @@ fn start_tag(tag: &str) -> Result<Element, Malformed> {
         if rest.is_empty() {
             break;
         }
-        let no_value = || wrong(&format!("an attribute of <{name}> has no value"));
+        let no_value = || malformed(&format!("an attribute of <{name}> has no value"));
         let (key, after) = rest.split_once('=').ok_or_else(no_value)?;
         let after = after.trim_start();
         let quote = after

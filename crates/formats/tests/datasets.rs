@@ -212,22 +212,22 @@ fn exif_orientation_is_applied_exactly_when_the_poses_include_it() {
 #[test]
 fn photographs_of_another_shape_than_their_cameras_are_named() {
     let folder = pictures(4, 40, 30);
-    let told = |keys: &str| {
+    let warnings_for = |keys: &str| {
         fs::write(folder.path().join("transforms.json"), transforms(4, keys)).unwrap();
         read(folder.path()).unwrap().warnings.join("\n")
     };
-    let exchanged = told(r#""fl_x": 35, "w": 30, "h": 40"#);
+    let exchanged = warnings_for(r#""fl_x": 35, "w": 30, "h": 40"#);
     assert!(
         exchanged.contains("4 of 4 photographs do not have the aspect ratio"),
         "{exchanged}"
     );
     assert!(exchanged.contains("40x30 pixels for 30x40"), "{exchanged}");
-    for same in [
+    for matching in [
         r#""fl_x": 35, "w": 80, "h": 60"#,
         r#""fl_x": 35, "w": 80, "h": 61"#,
         r#""fl_x": 35"#,
     ] {
-        assert_eq!(told(same), "");
+        assert_eq!(warnings_for(matching), "");
     }
 }
 
@@ -352,7 +352,7 @@ fn nerfstudio_splits_points_and_frames_with_their_own_camera() {
 }
 
 #[test]
-fn masks_and_maps_that_are_not_there_are_told() {
+fn missing_masks_and_maps_are_reported() {
     let folder = pictures(4, 40, 30);
     let with = transforms(4, r#""fl_x": 35"#).replacen(
         r#""transform_matrix""#,
@@ -360,9 +360,12 @@ fn masks_and_maps_that_are_not_there_are_told() {
         1,
     );
     fs::write(folder.path().join("transforms.json"), with).unwrap();
-    let told = read(folder.path()).unwrap().warnings.join("\n");
-    assert!(told.contains("1 masks are missing, such as m/0.png"), "{told}");
-    assert!(told.contains("1 depth maps are missing, such as d/0.png"), "{told}");
+    let warnings = read(folder.path()).unwrap().warnings.join("\n");
+    assert!(warnings.contains("1 masks are missing, such as m/0.png"), "{warnings}");
+    assert!(
+        warnings.contains("1 depth maps are missing, such as d/0.png"),
+        "{warnings}"
+    );
 }
 
 #[test]

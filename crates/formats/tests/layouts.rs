@@ -356,7 +356,7 @@ fn realitycapture() {
         fs::write(table.path().join("cameras.csv"), rows).unwrap();
         assert_same(&read(table.path(), DatasetFormat::RealityCapture), &truth);
 
-        let beside = folder("images");
+        let xmp_folder = folder("images");
         let [u, v] = truth.offset.map(|v| v / WIDTH);
         for i in 0..COUNT {
             let r = truth
@@ -371,9 +371,9 @@ fn realitycapture() {
                 </rdf:Description></rdf:RDF></x:xmpmeta>"#,
                 c.x, c.y, c.z
             );
-            fs::write(beside.path().join("images").join(format!("shot {i}.xmp")), text).unwrap();
+            fs::write(xmp_folder.path().join("images").join(format!("shot {i}.xmp")), text).unwrap();
         }
-        assert_same(&read(beside.path(), DatasetFormat::RealityCapture), &truth);
+        assert_same(&read(xmp_folder.path(), DatasetFormat::RealityCapture), &truth);
     }
 }
 

@@ -15,7 +15,7 @@ fn read(path: &Path) -> Dataset {
     read_dataset(path, &DatasetOptions::default()).unwrap_or_else(|error| panic!("{error}"))
 }
 
-fn with(path: &Path, downscale: f32, max_side: Option<u32>) -> Dataset {
+fn read_with(path: &Path, downscale: f32, max_side: Option<u32>) -> Dataset {
     let options = DatasetOptions {
         downscale,
         max_side,
@@ -118,7 +118,7 @@ fn fox_is_undistorted_and_its_missing_images_are_reported_once() {
     assert_eq!(sizes(&dataset).len(), 1, "one camera, one crop");
     let centre = focus(&dataset);
     assert!(dataset.views.iter().all(|view| in_front(view, centre)));
-    let small = with(&path, 1.0, Some(200));
+    let small = read_with(&path, 1.0, Some(200));
     assert_eq!(
         sizes(&small).into_iter().map(|(w, h)| w.max(h)).collect::<Vec<_>>(),
         [200]
@@ -164,7 +164,7 @@ fn lund_door_text_model_is_undistorted_onto_its_points() {
     // Measured: 5.6; 13 when shifted by a pixel.
     let error = colour_error(&dataset);
     assert!(error < 8.0, "{error}");
-    assert!(colour_error(&with(&path, 2.0, None)) < 16.0);
+    assert!(colour_error(&read_with(&path, 2.0, None)) < 16.0);
 }
 
 #[test]
@@ -201,7 +201,7 @@ fn chair_keeps_alpha_and_its_own_split() {
         shows += usize::from(photo.data[at + 3] > 0);
     }
     assert!(shows > 130, "{shows}");
-    assert_eq!(sizes(&with(&path, 2.5, None)), HashSet::from([(160, 160)]));
+    assert_eq!(sizes(&read_with(&path, 2.5, None)), HashSet::from([(160, 160)]));
 }
 
 #[test]
@@ -230,17 +230,17 @@ fn fern_uses_the_images_that_exist() {
         assert!((view.camera.pose.rotation * Vec3::NEG_Y).dot(up) > 0.9);
     }
     assert_eq!(
-        sizes(&with(&path, 8.0, None)),
+        sizes(&read_with(&path, 8.0, None)),
         HashSet::from([(504, 378)]),
         "images_8 is what 8 means"
     );
-    assert_eq!(sizes(&with(&path, 2.0, None)), HashSet::from([(252, 189)]));
+    assert_eq!(sizes(&read_with(&path, 2.0, None)), HashSet::from([(252, 189)]));
 }
 
 #[test]
 fn mary_rose_has_masks_that_keep_the_tankard() {
     let Some(path) = shared("maryRose") else { return };
-    let dataset = with(&path, 4.0, None);
+    let dataset = read_with(&path, 4.0, None);
     check_invariants(&dataset);
     assert_eq!(
         (dataset.views.len(), sizes(&dataset)),

@@ -7,7 +7,7 @@ use irradia_testkit::torch::zip;
 use std::io::Write;
 use std::path::Path;
 
-fn small() -> GaussianCloud {
+fn small_cloud() -> GaussianCloud {
     GaussianCloud {
         means: vec![[1.0, 2.0, 3.0]; 3],
         quats: vec![[1.0, 0.0, 0.0, 0.0]; 3],
@@ -19,10 +19,10 @@ fn small() -> GaussianCloud {
     }
 }
 
-fn written(name: &str) -> Vec<u8> {
+fn written_file(name: &str) -> Vec<u8> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join(name);
-    write_splats(&path, &small()).unwrap();
+    write_splats(&path, &small_cloud()).unwrap();
     std::fs::read(path).unwrap()
 }
 
@@ -32,38 +32,38 @@ fn gzip(bytes: &[u8]) -> Vec<u8> {
     packed.finish().unwrap()
 }
 
-fn refused<T>(result: Result<T, irradia_formats::Malformed>, what: &str) {
+fn assert_refused<T>(result: Result<T, irradia_formats::Malformed>, expected: &str) {
     let Err(error) = result else {
-        panic!("accepted; expected `{what}`")
+        panic!("accepted; expected `{expected}`")
     };
     let error = error.to_string();
     assert!(
-        error.contains(what) && !error.contains('\n') && error.len() < 400,
+        error.contains(expected) && !error.contains('\n') && error.len() < 400,
         "{error}"
     );
 }
 
 #[test]
 fn lengths_that_lie() {
-    let put = |bytes: &mut [u8], at: usize, word: u32| bytes[at..at + 4].copy_from_slice(&word.to_le_bytes());
+    let write_word = |bytes: &mut [u8], at: usize, word: u32| bytes[at..at + 4].copy_from_slice(&word.to_le_bytes());
     // SPZ: a header that declares four billion splats, and one that declares more than follow.
     let mut header = b"NGSP\x03\x00\x00\x00\xff\xff\xff\xff\x03\x0c\x00\x00".to_vec();
-    refused(parse::spz(&gzip(&header)), "4294967295 splats");
-    refused(parse::spz(&header), "4294967295 splats");
-    put(&mut header, 8, 100);
-    refused(parse::spz(&gzip(&header)), "gzip stream ends after 0");
+    assert_refused(parse::spz(&gzip(&header)), "4294967295 splats");
+    assert_refused(parse::spz(&header), "4294967295 splats");
+    write_word(&mut header, 8, 100);
+    assert_refused(parse::spz(&gzip(&header)), "gzip stream ends after 0");
     header[12] = 9;
-    refused(parse::spz(&gzip(&header)), "degree 9");
+    assert_refused(parse::spz(&gzip(&header)), "degree 9");
     let mut version_4 = b"NGSP\x04\x00\x00\x00\xff\xff\xff\xff\x03\x0c\x00\x06\x20\x00\x00\x00".to_vec();
     version_4.resize(200, 0);
-    refused(parse::spz(&version_4), "4294967295 splats");
-    put(&mut version_4, 8, 10);
-    refused(parse::spz(&version_4), "stream 0 declares 0 bytes");
-    put(&mut version_4, 16, 0xffff_fff0);
-    refused(parse::spz(&version_4), "outside of the file");
+    assert_refused(parse::spz(&version_4), "4294967295 splats");
+    write_word(&mut version_4, 8, 10);
+    assert_refused(parse::spz(&version_4), "stream 0 declares 0 bytes");
+    write_word(&mut version_4, 16, 0xffff_fff0);
+    assert_refused(parse::spz(&version_4), "outside of the file");
 
-    let ksplat = written("a.ksplat");
-    for (at, word, what) in [
+    let ksplat = written_file("a.ksplat");
+    for (at, word, expected) in [
         (4, u32::MAX, "ends too early"),
         (4096, u32::MAX, "splats in the space of 3"),
         (4096 + 4, u32::MAX, "ends too early"),
@@ -74,10 +74,10 @@ fn lengths_that_lie() {
         (20, 3, "level is 3"),
     ] {
         let mut bytes = ksplat.clone();
-        put(&mut bytes, at, word);
-        refused(parse::ksplat(&bytes), what);
+        write_word(&mut bytes, at, word);
+        assert_refused(parse::ksplat(&bytes), expected);
     }
-    refused(parse::splat(&[0; 33]), "multiple of 32");
+    assert_refused(parse::splat(&[0; 33]), "multiple of 32");
 
     let text = |header: &str| format!("ply\nformat binary_little_endian 1.0\n{header}end_header\n").into_bytes();
     let bounds: String = ["", "scale_"]
@@ -92,9 +92,9 @@ fn lengths_that_lie() {
         let header = format!("element chunk {chunks}\n{bounds}element vertex {vertices}\n{packed}");
         [text(&header), vec![0; 48 + 16 * 300]].concat()
     };
-    refused(parse::splat_ply(&ply(1, 300)), "need 2 chunks");
-    refused(parse::splat_ply(&ply(1, 1 << 60)), "declares 1152921504606846976 rows");
-    refused(parse::splat_ply(&ply(1 << 60, 1)), "declares 1152921504606846976 rows");
+    assert_refused(parse::splat_ply(&ply(1, 300)), "need 2 chunks");
+    assert_refused(parse::splat_ply(&ply(1, 1 << 60)), "declares 1152921504606846976 rows");
+    assert_refused(parse::splat_ply(&ply(1 << 60, 1)), "declares 1152921504606846976 rows");
 }
 
 #[test]
@@ -108,9 +108,9 @@ fn archives_that_unfold_without_end() {
     let directory = archive.windows(4).rposition(|w| w == b"PK\x01\x02").unwrap();
     archive[directory + 10] = 8;
     archive[directory + 24..directory + 28].fill(0xff);
-    refused(parse::sog(&archive), "meta.json: declares 4294967295 bytes");
+    assert_refused(parse::sog(&archive), "meta.json: declares 4294967295 bytes");
     // One mesh placed a hundred thousand times.
-    let glb = written("a.glb");
+    let glb = written_file("a.glb");
     let json = u32::from_le_bytes(glb[12..16].try_into().unwrap()) as usize;
     let text = String::from_utf8(glb[20..20 + json].to_vec()).unwrap();
     let nodes = vec!["{\"mesh\":0}"; 100_000].join(",");
@@ -134,7 +134,7 @@ fn archives_that_unfold_without_end() {
 fn scenes_of_images_with_wrong_sizes_and_indices() {
     let folder = tempfile::tempdir().unwrap();
     let meta = folder.path().join("scene/meta.json");
-    let mut cloud = small();
+    let mut cloud = small_cloud();
     // Two colours, so that one of their indices is not 0.
     cloud.sh[0] = -1.0;
     write_splats(&meta, &cloud).unwrap();
@@ -175,9 +175,9 @@ fn scenes_of_images_with_wrong_sizes_and_indices() {
 fn documents_that_refer_to_what_is_not_there() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.gltf");
-    write_splats(&path, &small()).unwrap();
+    write_splats(&path, &small_cloud()).unwrap();
     let text = std::fs::read_to_string(&path).unwrap();
-    for (from, to, what) in [
+    for (from, to, expected) in [
         ("\"nodes\":[0]", "\"nodes\":[7]", "node 7 does not exist"),
         ("\"nodes\":[0]", "\"nodes\":[0,0]", "two parents"),
         ("{\"mesh\":0}", "{\"mesh\":3}", "mesh of its node 0"),
@@ -219,7 +219,10 @@ fn documents_that_refer_to_what_is_not_there() {
         assert!(text.contains(from), "{from} is not in {text}");
         std::fs::write(&path, text.replacen(from, to, 1)).unwrap();
         let error = read_splats(&path).unwrap_err().to_string();
-        assert!(error.contains(what) && !error.contains('\n'), "{from} to {to}: {error}");
+        assert!(
+            error.contains(expected) && !error.contains('\n'),
+            "{from} to {to}: {error}"
+        );
     }
     // A buffer in a file beside it is read.
     let (start, end) = (
@@ -240,7 +243,7 @@ fn documents_that_refer_to_what_is_not_there() {
 fn splats_that_are_no_numbers_are_left_out_and_counted() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.splat");
-    let mut bytes = written("a.splat");
+    let mut bytes = written_file("a.splat");
     bytes[4..8].copy_from_slice(&f32::NAN.to_le_bytes());
     bytes[32 + 12..32 + 16].copy_from_slice(&(-1f32).to_le_bytes());
     std::fs::write(&path, bytes).unwrap();
@@ -256,7 +259,7 @@ fn a_failed_write_leaves_nothing_under_the_final_name() {
         .filter(|format| *format != SplatFormat::SogFolder)
     {
         let path = Path::new("/proc/irradia-cannot-write-here").with_file_name(format!("a{}", format.suffix()));
-        let error = write_splats(&path, &small()).unwrap_err().to_string();
+        let error = write_splats(&path, &small_cloud()).unwrap_err().to_string();
         assert!(error.contains("cannot write") && !path.exists(), "{error}");
     }
 }

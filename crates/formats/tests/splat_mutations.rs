@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 /// Executions of each reader in an ordinary test.
 const EXECUTIONS: u64 = 3000;
 /// Maximum time for a small file; generous, since machines that run tests are slow and busy.
-const MOST: Duration = Duration::from_secs(5);
+const MAX_DURATION: Duration = Duration::from_secs(5);
 
 type Parse = fn(&[u8]) -> bool;
 
@@ -32,9 +32,9 @@ impl Packing {
         match self {
             Self::None => vec![(String::new(), bytes.to_vec())],
             Self::Gzip => {
-                let mut inside = Vec::new();
-                flate2::read::GzDecoder::new(bytes).read_to_end(&mut inside).unwrap();
-                vec![(String::new(), inside)]
+                let mut unpacked = Vec::new();
+                flate2::read::GzDecoder::new(bytes).read_to_end(&mut unpacked).unwrap();
+                vec![(String::new(), unpacked)]
             }
             Self::Sog => stored_files(bytes),
             Self::Glb => {
@@ -120,7 +120,7 @@ fn seeds(suffix: &str, options: &[WriteOptions], fixtures: &[&str]) -> Vec<Vec<u
 }
 
 /// Values that break arithmetic, as text.
-const WORDS: [&str; 12] = [
+const NUMBER_WORDS: [&str; 12] = [
     "0",
     "-1",
     "1e999",
@@ -178,7 +178,7 @@ fn mutate(bytes: &mut Vec<u8>, rng: &mut Rng) {
                     .iter()
                     .take_while(|b| b.is_ascii_digit() || **b == b'.')
                     .count();
-                bytes.splice(start..start + length, WORDS[rng.below(12) as usize].bytes());
+                bytes.splice(start..start + length, NUMBER_WORDS[rng.below(12) as usize].bytes());
             }
         }
     }
@@ -187,11 +187,11 @@ fn mutate(bytes: &mut Vec<u8>, rng: &mut Rng) {
 /// Runs a reader on its seeds and on mutations of them.
 fn fuzz(reader: &str, packing: Packing, parse: Parse, seeds: &[Vec<u8>]) {
     let executions = std::env::var("IRRADIA_FUZZ_EXECUTIONS").map_or(EXECUTIONS, |count| count.parse().unwrap());
-    let insides: Vec<_> = seeds.iter().map(|seed| packing.unpack(seed)).collect();
-    for (seed, inside) in seeds.iter().zip(&insides) {
+    let unpacked_seeds: Vec<_> = seeds.iter().map(|seed| packing.unpack(seed)).collect();
+    for (seed, unpacked) in seeds.iter().zip(&unpacked_seeds) {
         assert!(parse(seed), "{reader}: a seed is refused");
         assert!(
-            parse(&packing.pack(inside)),
+            parse(&packing.pack(unpacked)),
             "{reader}: a seed that is packed again is refused"
         );
     }
@@ -206,7 +206,7 @@ fn fuzz(reader: &str, packing: Packing, parse: Parse, seeds: &[Vec<u8>]) {
                 bytes
             }
             _ => {
-                let mut parts = insides[which].clone();
+                let mut parts = unpacked_seeds[which].clone();
                 let part = rng.below(parts.len() as u32) as usize;
                 mutate(&mut parts[part].1, rng);
                 packing.pack(&parts)
@@ -216,7 +216,10 @@ fn fuzz(reader: &str, packing: Packing, parse: Parse, seeds: &[Vec<u8>]) {
         let outcome = std::panic::catch_unwind(|| parse(&bytes));
         slowest = slowest.max(started.elapsed());
         assert!(outcome.is_ok(), "{reader}: execution {execution} panics");
-        assert!(slowest < MOST, "{reader}: execution {execution} takes {slowest:?}");
+        assert!(
+            slowest < MAX_DURATION,
+            "{reader}: execution {execution} takes {slowest:?}"
+        );
         accepted += u64::from(outcome.unwrap_or(false));
     }
     println!("{reader}: {executions} executions, {accepted} accepted, the slowest {slowest:?}");
@@ -227,7 +230,7 @@ fn fuzz(reader: &str, packing: Packing, parse: Parse, seeds: &[Vec<u8>]) {
     );
 }
 
-const NORMAL: &[WriteOptions] = &[WriteOptions {
+const DEFAULT_OPTIONS: &[WriteOptions] = &[WriteOptions {
     quality: Quality::Normal,
     spz_version: SpzVersion::V3,
     sog: None,
@@ -237,7 +240,7 @@ const NORMAL: &[WriteOptions] = &[WriteOptions {
 fn ply() {
     let seeds = seeds(
         ".ply",
-        NORMAL,
+        DEFAULT_OPTIONS,
         &["fixtures_metalsplatter/test-splat.3-points-from-train.ply"],
     );
     fuzz("PLY", Packing::None, |b| parse::splat_ply(b).is_ok(), &seeds);
@@ -245,7 +248,7 @@ fn ply() {
 
 #[test]
 fn compressed_ply() {
-    let seeds = seeds(".compressed.ply", NORMAL, &[]);
+    let seeds = seeds(".compressed.ply", DEFAULT_OPTIONS, &[]);
     fuzz("compressed PLY", Packing::None, |b| parse::splat_ply(b).is_ok(), &seeds);
 }
 
@@ -253,13 +256,13 @@ fn compressed_ply() {
 fn spz_gzip() {
     let v2 = WriteOptions {
         spz_version: SpzVersion::V2,
-        ..NORMAL[0]
+        ..DEFAULT_OPTIONS[0]
     };
     let fixtures = [
         "fixtures_splat-transform/minimal-v2.spz",
         "fixtures_splat-transform/minimal-v3.spz",
     ];
-    let seeds = seeds(".spz", &[NORMAL[0], v2], &fixtures);
+    let seeds = seeds(".spz", &[DEFAULT_OPTIONS[0], v2], &fixtures);
     fuzz("SPZ 2 and 3", Packing::Gzip, |b| parse::spz(b).is_ok(), &seeds);
 }
 
@@ -267,7 +270,7 @@ fn spz_gzip() {
 fn spz_zstd_and_raw() {
     let v4 = WriteOptions {
         spz_version: SpzVersion::V4,
-        ..NORMAL[0]
+        ..DEFAULT_OPTIONS[0]
     };
     let fixtures = [
         "fixtures_splat-transform/minimal-v4.spz",
@@ -279,13 +282,16 @@ fn spz_zstd_and_raw() {
 
 #[test]
 fn splat() {
-    let seeds = seeds(".splat", NORMAL, &["fixtures_splat-transform/minimal.splat"]);
+    let seeds = seeds(".splat", DEFAULT_OPTIONS, &["fixtures_splat-transform/minimal.splat"]);
     fuzz(".splat", Packing::None, |b| parse::splat(b).is_ok(), &seeds);
 }
 
 #[test]
 fn ksplat() {
-    let levels = [Quality::High, Quality::Normal, Quality::Low].map(|quality| WriteOptions { quality, ..NORMAL[0] });
+    let levels = [Quality::High, Quality::Normal, Quality::Low].map(|quality| WriteOptions {
+        quality,
+        ..DEFAULT_OPTIONS[0]
+    });
     let seeds = seeds(".ksplat", &levels, &["fixtures_splat-transform/minimal.ksplat"]);
     fuzz(".ksplat", Packing::None, |b| parse::ksplat(b).is_ok(), &seeds);
 }
@@ -296,14 +302,14 @@ fn sog() {
         "SOG",
         Packing::Sog,
         |b| parse::sog(b).is_ok(),
-        &seeds(".sog", NORMAL, &[]),
+        &seeds(".sog", DEFAULT_OPTIONS, &[]),
     );
 }
 
 #[test]
 fn glb() {
-    let mut seeds = seeds(".glb", NORMAL, &["khr/khr_conformance_matrix.glb"]);
-    seeds.extend(self::seeds(".spz.glb", NORMAL, &[]));
+    let mut seeds = seeds(".glb", DEFAULT_OPTIONS, &["khr/khr_conformance_matrix.glb"]);
+    seeds.extend(self::seeds(".spz.glb", DEFAULT_OPTIONS, &[]));
     fuzz("glb", Packing::Glb, |b| parse::glb(b).is_ok(), &seeds);
 }
 
@@ -313,6 +319,6 @@ fn gltf() {
         "gltf",
         Packing::None,
         |b| parse::gltf(b).is_ok(),
-        &seeds(".gltf", NORMAL, &[]),
+        &seeds(".gltf", DEFAULT_OPTIONS, &[]),
     );
 }

@@ -55,14 +55,14 @@ struct Differences {
 fn differences(a: &GaussianCloud, b: &GaussianCloud) -> Differences {
     assert_eq!(a.len(), b.len());
     let sigmoid = |x: f32| 1.0 / (1.0 + (-x).exp());
-    let mut most = Differences::default();
+    let mut largest = Differences::default();
     let rest = 3 * a.sh_coefficients().min(b.sh_coefficients());
     for (i, j) in by_x(a).into_iter().zip(by_x(b)) {
         for c in 0..3 {
-            most.position = most.position.max((a.means[i][c] - b.means[j][c]).abs());
-            most.log_scale = most.log_scale.max((a.log_scales[i][c] - b.log_scales[j][c]).abs());
+            largest.position = largest.position.max((a.means[i][c] - b.means[j][c]).abs());
+            largest.log_scale = largest.log_scale.max((a.log_scales[i][c] - b.log_scales[j][c]).abs());
         }
-        most.opacity = most
+        largest.opacity = largest
             .opacity
             .max((sigmoid(a.opacity_logits[i]) - sigmoid(b.opacity_logits[j])).abs());
         let (p, q) = (
@@ -72,16 +72,16 @@ fn differences(a: &GaussianCloud, b: &GaussianCloud) -> Differences {
         for k in 0..rest {
             let difference = (p[k] - q[k]).abs();
             match k {
-                ..3 => most.color = most.color.max(difference * sh::C0 as f32),
-                _ => most.harmonic = most.harmonic.max(difference),
+                ..3 => largest.color = largest.color.max(difference * sh::C0 as f32),
+                _ => largest.harmonic = largest.harmonic.max(difference),
             }
         }
         let length = |q: &[f32; 4]| q.iter().map(|v| v * v).sum::<f32>().sqrt();
         let dot: f32 = a.quats[i].iter().zip(b.quats[j]).map(|(p, q)| p * q).sum();
         let dot = dot.abs() / (length(&a.quats[i]) * length(&b.quats[j]));
-        most.rotation = most.rotation.max(2.0 * dot.min(1.0).acos());
+        largest.rotation = largest.rotation.max(2.0 * dot.min(1.0).acos());
     }
-    most
+    largest
 }
 
 fn round_trip(name: &str, cloud: &GaussianCloud, options: WriteOptions) -> GaussianCloud {
@@ -129,20 +129,20 @@ fn every_format_round_trips_within_its_precision() {
             let back = round_trip(name, &cloud, options);
             let format = SplatFormat::of(Path::new(name)).unwrap();
             assert_eq!(back.sh_degree, degree.min(format.max_degree()), "{name}");
-            let most = differences(&cloud, &back);
-            let holds = most.position <= position
-                && most.log_scale <= scale
-                && most.opacity <= color
-                && most.color
+            let largest = differences(&cloud, &back);
+            let holds = largest.position <= position
+                && largest.log_scale <= scale
+                && largest.opacity <= color
+                && largest.color
                     <= if format == SplatFormat::Spz || format == SplatFormat::GlbSpz {
                         0.0037
                     } else {
                         color
                     }
-                && most.harmonic <= harmonic
-                && most.rotation <= rotation;
+                && largest.harmonic <= harmonic
+                && largest.rotation <= rotation;
             if !holds {
-                failures.push(format!("{name} {quality:?} degree {degree}: {most:?}"));
+                failures.push(format!("{name} {quality:?} degree {degree}: {largest:?}"));
             }
             // A second trip finds every value on its step.
             if !matches!(
@@ -201,10 +201,10 @@ fn an_asymmetric_scene_stands_upright_and_unmirrored_in_every_format() {
         };
         write_splats(&path, &cloud).unwrap();
         let back = read_splats(&path).unwrap();
-        let most = differences(&cloud, &back);
+        let largest = differences(&cloud, &back);
         assert!(
-            most.position < 0.01 && most.rotation < 0.03 && most.harmonic < 0.03,
-            "{format}: {most:?}"
+            largest.position < 0.01 && largest.rotation < 0.03 && largest.harmonic < 0.03,
+            "{format}: {largest:?}"
         );
     }
 

@@ -11,7 +11,7 @@ const TENSORS: [NamedTensor; 3] = [
     ("one", &[], &[7.0]),
 ];
 
-fn safe() -> Vec<u8> {
+fn safetensors_file() -> Vec<u8> {
     let bytes: Vec<Vec<u8>> = TENSORS
         .iter()
         .map(|(_, _, values)| values.iter().flat_map(|v| v.to_le_bytes()).collect())
@@ -30,7 +30,7 @@ fn every_format_gives_the_same_tensors() {
     for (name, bytes) in [
         ("a.pth", archive(&TENSORS)),
         ("b.pth", stream(&TENSORS)),
-        ("c.safetensors", safe()),
+        ("c.safetensors", safetensors_file()),
     ] {
         let path = folder.path().join(name);
         std::fs::write(&path, bytes).unwrap();
@@ -71,60 +71,63 @@ fn with_tensor(kind: &str, offset: &str, shape: &str, strides: &str) -> Vec<u8> 
 
 #[test]
 fn hostile_files_are_rejected_in_one_line() {
-    let refused = |bytes: &[u8], part: &str| {
-        let error = parse::tensors(bytes).expect_err(part).to_string();
-        assert!(error.contains(part) && !error.contains('\n'), "{error}, and not {part}");
+    let assert_refused = |bytes: &[u8], expected: &str| {
+        let error = parse::tensors(bytes).expect_err(expected).to_string();
+        assert!(
+            error.contains(expected) && !error.contains('\n'),
+            "{error}, and not {expected}"
+        );
     };
     assert_eq!(
         parse::tensors(&with_tensor("Float", "K\u{2}", "K\u{2}K\u{7}", "K\u{7}K\u{1}")).unwrap()["a"].values,
         [0.0; 14]
     );
     // Wrong sizes, in the tensor and in the storage.
-    refused(
+    assert_refused(
         &with_tensor("Float", "K\u{3}", "K\u{2}K\u{7}", "K\u{7}K\u{1}"),
         "larger than its storage",
     );
-    refused(
+    assert_refused(
         &with_tensor("Float", "J\u{7f}\u{7f}\u{7f}\u{7f}", "K\u{1}", "K\u{1}"),
         "larger than its storage",
     );
     let huge = "J\u{7f}\u{7f}\u{7f}\u{7f}".repeat(3);
-    refused(
+    assert_refused(
         &with_tensor("Float", "K\u{0}", &huge, "K\u{1}K\u{1}K\u{1}"),
         "not contiguous",
     );
-    refused(
+    assert_refused(
         &with_tensor("Float", "K\u{0}", &"K\u{1}".repeat(40), &"K\u{1}".repeat(40)),
         "unsupported kind",
     );
-    refused(
+    assert_refused(
         &with_tensor("Float", "K\u{0}", "K\u{2}K\u{7}", "K\u{1}K\u{2}"),
         "not contiguous",
     );
-    refused(
+    assert_refused(
         &with_tensor("Double", "K\u{0}", "K\u{1}", "K\u{1}"),
         "only 32-bit floats",
     );
     // A call that would run a program in Python is only a call that makes no tensor.
-    refused(&with_pickle(b"\x80\x02cos\nsystem\n(U\x02lstR."), "state_dict()");
+    assert_refused(&with_pickle(b"\x80\x02cos\nsystem\n(U\x02lstR."), "state_dict()");
     // Pickles that never end, pop from an empty stack, nest, or call themselves.
-    refused(&with_pickle(b"\x80\x02}"), "ends too early");
-    refused(&with_pickle(b"\x80\x02X\xff\xff\xff\xff"), "ends too early");
-    refused(&with_pickle(b"\x80\x02u"), "no mark");
-    refused(&with_pickle(b"\x80\x02\x87"), "empty stack");
-    refused(&with_pickle(b"\x80\x02h\x07"), "recalls");
-    refused(&with_pickle(b"\x80\x04."), "protocol 4");
-    refused(&with_pickle(b"\x80\x02\x93"), "opcode 0x93");
-    refused(&with_pickle(&b"(".repeat(3 << 20)), "too many");
-    refused(&with_pickle(&b"]".repeat(3 << 20)), "too many");
+    assert_refused(&with_pickle(b"\x80\x02}"), "ends too early");
+    assert_refused(&with_pickle(b"\x80\x02X\xff\xff\xff\xff"), "ends too early");
+    assert_refused(&with_pickle(b"\x80\x02u"), "no mark");
+    assert_refused(&with_pickle(b"\x80\x02\x87"), "empty stack");
+    assert_refused(&with_pickle(b"\x80\x02h\x07"), "recalls");
+    assert_refused(&with_pickle(b"\x80\x04."), "protocol 4");
+    assert_refused(&with_pickle(b"\x80\x02\x93"), "opcode 0x93");
+    assert_refused(&with_pickle(&b"(".repeat(3 << 20)), "too many");
+    assert_refused(&with_pickle(&b"]".repeat(3 << 20)), "too many");
     let circle = with_pickle(b"\x80\x02}q\x00(U\x01ah\x00u.");
-    refused(&circle, "unsupported kind");
+    assert_refused(&circle, "unsupported kind");
     // A list of 50,000 pairs that is converted to a dict 50,000 times.
     let mut bomb = b"\x80\x02ccollections\nOrderedDict\nq\x00](".to_vec();
     bomb.extend(b"NN\x86".repeat(50_000));
     bomb.extend(b"e\x85q\x01");
     bomb.extend(b"h\x00h\x01R".repeat(50_000));
-    refused(&with_pickle(&bomb), "too many");
+    assert_refused(&with_pickle(&bomb), "too many");
     // The same storage a thousand times is larger than the file.
     let name = |i: usize| format!("t{i}");
     let names: Vec<String> = (0..1000).map(name).collect();
@@ -140,20 +143,20 @@ fn hostile_files_are_rejected_in_one_line() {
         ("n/data.pkl".to_owned(), stretched),
         ("n/data/0".to_owned(), vec![0; 1 << 16]),
     ];
-    refused(&zip(&files), "larger than the file");
+    assert_refused(&zip(&files), "larger than the file");
     // Archives.
     let whole = archive(&TENSORS);
-    refused(&whole[..whole.len() - 5], "its end is missing");
+    assert_refused(&whole[..whole.len() - 5], "its end is missing");
     let mut packed = whole.clone();
     let directory = whole.windows(4).position(|w| w == b"PK\x01\x02").unwrap();
     packed[directory + 10] = 8;
-    refused(&packed, "compressed");
+    assert_refused(&packed, "compressed");
     let mut elsewhere = whole.clone();
     elsewhere[directory + 42] = 9;
-    refused(&elsewhere, "not where the directory says");
-    refused(&zip(&[("readme".to_owned(), vec![1])]), "no data.pkl");
+    assert_refused(&elsewhere, "not where the directory says");
+    assert_refused(&zip(&[("readme".to_owned(), vec![1])]), "no data.pkl");
     let legacy = stream(&TENSORS);
-    refused(&legacy[..legacy.len() - 3], "declares");
-    refused(b"\x80\x02}.", "does not begin");
-    refused(b"", "neither");
+    assert_refused(&legacy[..legacy.len() - 3], "declares");
+    assert_refused(b"\x80\x02}.", "does not begin");
+    assert_refused(b"", "neither");
 }

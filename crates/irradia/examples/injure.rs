@@ -129,7 +129,7 @@ impl LocalGain {
 }
 
 /// Covers a box of 0.55 x 0.2 times the height at a random place: dark legs, a chequered shirt, a head, the same in every photograph.
-fn stand_in_the_way(photo: &mut Photo, rng: &mut Rng) {
+fn add_person(photo: &mut Photo, rng: &mut Rng) {
     let (columns, rows) = (photo.width as usize, photo.height as usize);
     let (tall, wide) = (rows * 11 / 20, rows / 5);
     let left = rng.below((columns.saturating_sub(wide) + 1) as u32) as usize;
@@ -179,7 +179,7 @@ fn write_view(args: &Args, dataset: &Dataset, extent: f32, view: usize) -> Resul
         }
     }
     if args.people > 0.0 && dataset.train.contains(&view) && rng.uniform() < args.people {
-        stand_in_the_way(&mut photo, &mut rng);
+        add_person(&mut photo, &mut rng);
     }
     let name = format!("images/{view:05}.png");
     write_png(

@@ -8,7 +8,7 @@ use std::io::{ErrorKind, Write, stderr, stdout};
 ///
 /// # Errors
 /// When it cannot be written; a closed pipe is no error.
-pub fn say(line: impl Display) -> Result<()> {
+pub fn print_line(line: impl Display) -> Result<()> {
     match writeln!(stdout(), "{line}") {
         Err(error) if error.kind() != ErrorKind::BrokenPipe => Err(error).context("cannot write to standard output"),
         _ => Ok(()),

@@ -22,10 +22,10 @@ use std::error::Error;
 use std::path::{Path, PathBuf};
 
 /// Number of floaters of each kind: isolated, needle, huge, unseen, in front.
-const EACH: usize = 100;
+const FLOATERS_PER_KIND: usize = 100;
 const SEED: u64 = 7;
 /// The files that belong to a scene in its run.
-const BESIDE: [&str; 4] = ["run.json", "recipe.toml", "cameras.json", "world.json"];
+const RUN_FILES: [&str; 4] = ["run.json", "recipe.toml", "cameras.json", "world.json"];
 
 fn main() -> Result<(), Box<dyn Error>> {
     println!(
@@ -47,22 +47,28 @@ fn row(run: &Path) -> Result<String, Box<dyn Error>> {
     let n = trained.draft().len();
     let found = floater_scores(trained.draft());
     let psnr = |cloud: &GaussianCloud| held_out_psnr(cloud, &scene, &dataset);
-    let (before, clean) = (psnr(&trained.draft().cloud)?, psnr(&without(trained.draft(), &found))?);
+    let (before, clean) = (
+        psnr(&trained.draft().cloud)?,
+        psnr(&without_floaters(trained.draft(), &found))?,
+    );
 
     let mut cloud = read_splats(&run.join(SCENE))?;
     plant(&mut cloud, &trained.draft().cameras, SEED);
     let folder = tempfile::tempdir()?;
-    for name in BESIDE {
+    for name in RUN_FILES {
         let _ = std::fs::copy(run.join(name), folder.path().join(name));
     }
     write_splats(&folder.path().join(SCENE), &cloud)?;
     let planted = Editing::open(folder.path())?;
     let scores = floater_scores(planted.draft());
     let count = |scores: &[FloaterScores]| scores.iter().filter(|score| score.score() >= 1.0).count();
-    let kinds: Vec<String> = scores[n..].chunks(EACH).map(|kind| count(kind).to_string()).collect();
-    let mut blind = planted.draft().clone();
-    blind.photographs = None;
-    let blind_scores = floater_scores(&blind);
+    let kinds: Vec<String> = scores[n..]
+        .chunks(FLOATERS_PER_KIND)
+        .map(|kind| count(kind).to_string())
+        .collect();
+    let mut without_photographs = planted.draft().clone();
+    without_photographs.photographs = None;
+    let blind_scores = floater_scores(&without_photographs);
     let percent = |found: usize| 100.0 * found as f64 / n as f64;
     Ok(format!(
         "| {} | {n} | {before:.2} | {:.2} % | {clean:.2} | {:.2} | {} | {:.2} % | {:.2} | {} of 500, {:.2} %: {:.2} |",
@@ -71,20 +77,20 @@ fn row(run: &Path) -> Result<String, Box<dyn Error>> {
         psnr(&cloud)?,
         kinds.join(", "),
         percent(count(&scores[..n])),
-        psnr(&without(planted.draft(), &scores))?,
+        psnr(&without_floaters(planted.draft(), &scores))?,
         count(&blind_scores[n..]),
         percent(count(&blind_scores[..n])),
-        psnr(&without(&blind, &blind_scores))?,
+        psnr(&without_floaters(&without_photographs, &blind_scores))?,
     ))
 }
 
 /// The splats that are not floaters.
-fn without(draft: &Draft, scores: &[FloaterScores]) -> GaussianCloud {
+fn without_floaters(draft: &Draft, scores: &[FloaterScores]) -> GaussianCloud {
     let mut draft = draft.clone();
     for (i, score) in scores.iter().enumerate() {
         draft.hidden.set(i, score.score() >= 1.0);
     }
-    draft.shown().into_owned()
+    draft.visible_cloud().into_owned()
 }
 
 fn held_out_psnr(cloud: &GaussianCloud, scene: &Scene, dataset: &Dataset) -> Result<f64, Box<dyn Error>> {
@@ -102,8 +108,8 @@ fn held_out_psnr(cloud: &GaussianCloud, scene: &Scene, dataset: &Dataset) -> Res
     Ok(mean.psnr)
 }
 
-/// Adds [`EACH`] floaters of each kind: isolated balls between camera and subject; needles; splats larger than the distance of the cameras;
-/// balls outside the scene; balls close to a camera.
+/// Adds [`FLOATERS_PER_KIND`] floaters of each kind: isolated balls between camera and subject; needles; splats larger than the distance of
+/// the cameras; balls outside the scene; balls close to a camera.
 fn plant(cloud: &mut GaussianCloud, cameras: &[Camera], seed: u64) {
     let mut rng = Rng::new(seed, 0);
     let focus = focus_point(cameras);
@@ -112,7 +118,7 @@ fn plant(cloud: &mut GaussianCloud, cameras: &[Camera], seed: u64) {
     let surfaces = cloud.means.clone();
     let width = 3 * cloud.sh_coefficients();
     for kind in 0..5 {
-        for _ in 0..EACH {
+        for _ in 0..FLOATERS_PER_KIND {
             let mut opacity = rng.range(0.3, 0.95);
             let (mean, sizes) = loop {
                 let camera = &cameras[rng.below(cameras.len() as u32) as usize];

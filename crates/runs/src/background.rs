@@ -9,28 +9,28 @@ use std::fmt::{self, Display, Formatter};
 use std::str::FromStr;
 
 /// Number of photographs that are examined, and their longer side, pixels.
-const SAMPLES: usize = 8;
-const SIDE: f32 = 400.0;
+const SAMPLED_PHOTOS: usize = 8;
+const SAMPLE_SIDE: f32 = 400.0;
 /// Minimum share of white pixels at the border of a photograph whose object is cut out; the object may touch the border.
-const BORDER_SHARE: f64 = 0.9;
+const MIN_WHITE_BORDER_SHARE: f64 = 0.9;
 /// Minimum value of a white pixel: compression leaves some noise.
-const WHITE: u8 = 250;
+const MIN_WHITE: u8 = 250;
 /// Minimum channel value of a white backdrop, which may be shaded and tinted, and maximum channel value of a black one, which a flash may
 /// brighten. Anything in between, such as floors and tables, counts as a surface.
-const WHITE_BACKDROP: u8 = 224;
-const BLACK_BACKDROP: u8 = 64;
+const MIN_WHITE_BACKDROP: u8 = 224;
+const MAX_BLACK_BACKDROP: u8 = 64;
 /// Maximum difference of a backdrop's pixels from its colour, in each channel: cloth and paper have folds and shading.
-const SHADE: u8 = 24;
+const MAX_BACKDROP_DIFFERENCE: u8 = 24;
 /// Minimum share of border pixels that show the backdrop: averaged over the photographs, and in each.
-const BACKDROP_SHARES: [f64; 2] = [0.8, 0.5];
+const MIN_BACKDROP_SHARES: [f64; 2] = [0.8, 0.5];
 /// Width of a mask's rim, pixels: near the edge of a generous mask, kept pixels still show what is behind the object.
-const RIM: usize = 3;
+const RIM_WIDTH: usize = 3;
 /// Minimum share of border pixels that masks exclude if they exclude the surroundings of an object, and minimum share of rim pixels that
 /// have the backdrop's colour, both averaged over the photographs. Measured: 0.79 and 0.98 for a medal in front of dark blue, 0.99 and
 /// 0.63 for a plush dog in front of paper, 0.97 and 0.2 for a box cut out along its outlines; masks of people and of whatever holds the
 /// camera exclude less of the border, and their rim shows the scene.
-const LEFT_OUT: f64 = 0.6;
-const RIM_SHARE: f64 = 0.5;
+const MIN_EXCLUDED_SHARE: f64 = 0.6;
+const MIN_RIM_SHARE: f64 = 0.5;
 
 /// Colours of pixels at the edge of the known part of a photograph: at its border, or at the rim of its mask.
 type Border = Vec<[u8; 3]>;
@@ -48,7 +48,7 @@ fn border(photo: &Photo) -> Border {
 /// The rim pixels of `mask`: those on its kept side if `keeps`, otherwise those on its excluded side.
 fn rim(photo: &Photo, mask: &[u8], keeps: bool) -> Border {
     let (width, height) = (photo.width as usize, photo.height as usize);
-    let around = |at: usize, end: usize| at.saturating_sub(RIM)..(at + RIM + 1).min(end);
+    let around = |at: usize, end: usize| at.saturating_sub(RIM_WIDTH)..(at + RIM_WIDTH + 1).min(end);
     let is_kept = |at: usize| mask[at] != 0;
     let is_rim = |at: &usize| {
         let (x, y) = (at % width, at / width);
@@ -59,7 +59,7 @@ fn rim(photo: &Photo, mask: &[u8], keeps: bool) -> Border {
 }
 
 /// The pixels that `mask` excludes.
-fn outside(photo: &Photo, mask: &[u8]) -> Border {
+fn excluded(photo: &Photo, mask: &[u8]) -> Border {
     colors(photo, (0..mask.len()).filter(|at| mask[*at] == 0))
 }
 
@@ -70,7 +70,7 @@ fn share(border: &Border, holds: impl Fn([u8; 3]) -> bool) -> f64 {
 
 /// Whether nearly all of the pixels are white.
 fn is_white(border: &Border) -> bool {
-    share(border, |color| color.iter().all(|value| *value >= WHITE)) >= BORDER_SHARE
+    share(border, |color| color.iter().all(|value| *value >= MIN_WHITE)) >= MIN_WHITE_BORDER_SHARE
 }
 
 /// The median of each channel.
@@ -83,14 +83,19 @@ fn median(colors: &[[u8; 3]]) -> [u8; 3] {
 }
 
 /// The typical colour of `borders`: the median of their medians.
-fn common(borders: &[Border]) -> [u8; 3] {
+fn typical_color(borders: &[Border]) -> [u8; 3] {
     let medians: Vec<[u8; 3]> = borders.iter().map(|border| median(border)).collect();
     median(&medians)
 }
 
 /// For each of `borders`, the share of its pixels that are near `color`.
 fn shares_near(borders: &[Border], color: [u8; 3]) -> Vec<f64> {
-    let is_near = |other: [u8; 3]| other.iter().zip(color).all(|(a, b)| a.abs_diff(b) <= SHADE);
+    let is_near = |other: [u8; 3]| {
+        other
+            .iter()
+            .zip(color)
+            .all(|(a, b)| a.abs_diff(b) <= MAX_BACKDROP_DIFFERENCE)
+    };
     borders.iter().map(|border| share(border, is_near)).collect()
 }
 
@@ -101,7 +106,7 @@ fn shares_near(borders: &[Border], color: [u8; 3]) -> Vec<f64> {
 /// cloth in front of black, 2,000 steps: 32.12, 36.41.
 fn masked_backdrop(photos: &[Photo]) -> Option<[u8; 3]> {
     let left_out = photos.iter().map(Photo::border_left_out).sum::<f64>() / photos.len() as f64;
-    if left_out < LEFT_OUT {
+    if left_out < MIN_EXCLUDED_SHARE {
         return None;
     }
     let of_each = |part: &dyn Fn(&Photo, &[u8]) -> Border| {
@@ -112,24 +117,24 @@ fn masked_backdrop(photos: &[Photo]) -> Option<[u8; 3]> {
     };
     let shows = |rims: &[Border], color: [u8; 3]| {
         let shares = shares_near(rims, color);
-        shares.iter().sum::<f64>() >= RIM_SHARE * shares.len().max(1) as f64
+        shares.iter().sum::<f64>() >= MIN_RIM_SHARE * shares.len().max(1) as f64
     };
     let [kept, beside] = [true, false].map(|keeps| of_each(&|photo, mask| rim(photo, mask, keeps)));
-    let backdrop = common(&of_each(&outside));
-    if shows(&kept, common(&beside)) && shows(&beside, backdrop) {
+    let backdrop = typical_color(&of_each(&excluded));
+    if shows(&kept, typical_color(&beside)) && shows(&beside, backdrop) {
         return Some(backdrop);
     }
-    let color = common(&kept);
+    let color = typical_color(&kept);
     shows(&kept, color).then_some(color)
 }
 
 /// The colour of the white or black cloth, paper or box that all photographs have around their object, if there is one.
 fn backdrop(borders: &[Border]) -> Option<[u8; 3]> {
-    let color = common(borders);
+    let color = typical_color(borders);
     let shares = shares_near(borders, color);
-    let is_possible =
-        color.iter().all(|value| *value >= WHITE_BACKDROP) || color.iter().all(|value| *value <= BLACK_BACKDROP);
-    let [in_mean, in_each] = BACKDROP_SHARES;
+    let is_possible = color.iter().all(|value| *value >= MIN_WHITE_BACKDROP)
+        || color.iter().all(|value| *value <= MAX_BLACK_BACKDROP);
+    let [in_mean, in_each] = MIN_BACKDROP_SHARES;
     let is_backdrop = is_possible
         && shares.iter().all(|share| *share >= in_each)
         && shares.iter().sum::<f64>() >= in_mean * shares.len() as f64;
@@ -186,11 +191,11 @@ impl Background {
     ///
     /// # Errors
     /// When one of these photographs cannot be read.
-    pub fn usual(dataset: &Dataset, covers: bool) -> Result<Option<Self>, RunError> {
+    pub fn default_for(dataset: &Dataset, covers: bool) -> Result<Option<Self>, RunError> {
         let load = |view: &usize| {
             let view = &dataset.views[*view];
             let k = view.camera.intrinsics;
-            let small = k.scaled((SIDE / k.width.max(k.height) as f32).min(1.0));
+            let small = k.scaled((SAMPLE_SIDE / k.width.max(k.height) as f32).min(1.0));
             let photo = view.photo.load_at(small.width, small.height);
             photo.map_err(|error: LoadError| RunError::Train(TrainError::Photo(error)))
         };
@@ -202,7 +207,7 @@ impl Background {
             let transparent = dataset.kind == "Blender" && alpha.iter().any(|a| *a < 255);
             return Ok(transparent.then_some(Self::White));
         }
-        let every = dataset.train.len().div_ceil(SAMPLES);
+        let every = dataset.train.len().div_ceil(SAMPLED_PHOTOS);
         let others = dataset.train.iter().step_by(every).skip(1).map(load);
         let photos: Vec<Photo> = std::iter::once(Ok(first)).chain(others).collect::<Result<_, _>>()?;
         let borders: Vec<Border> = photos.iter().map(border).collect();
@@ -270,7 +275,7 @@ impl FromStr for Background {
 }
 
 /// Description of the training and evaluation background of `recipe`.
-pub(crate) fn in_words(recipe: &Recipe) -> String {
+pub(crate) fn description(recipe: &Recipe) -> String {
     let color = match recipe.render.background {
         [1.0, 1.0, 1.0] => "white".to_owned(),
         [0.0, 0.0, 0.0] => "black".to_owned(),
@@ -346,7 +351,7 @@ mod tests {
         let covers = |background: Background| {
             let mut recipe = Recipe::parse("fast", Recipe::built_in("fast").unwrap(), &[]).unwrap();
             background.apply_to(&mut recipe);
-            (recipe.uses(Param::CoverWeight), in_words(&recipe))
+            (recipe.uses(Param::CoverWeight), description(&recipe))
         };
         assert_eq!(covers(Background::Grey), (true, "grey".into()));
         assert_eq!(covers(Background::White), (false, "white".into()));
@@ -378,7 +383,7 @@ mod tests {
             }
         };
         let usual = |value: &dyn Fn(usize) -> u8, channels, covers| {
-            Background::usual(&masked_dataset(value, channels, None), covers).unwrap()
+            Background::default_for(&masked_dataset(value, channels, None), covers).unwrap()
         };
         let uniform = |value: u8| move |_: usize| value;
         let striped = |i: usize| if (i / 3).is_multiple_of(2) { 20 } else { 160 };
@@ -399,7 +404,7 @@ mod tests {
         };
         let masked = |keeps: &dyn Fn(usize) -> bool| {
             let mask = (0..64).map(|at| if keeps(at) { 255 } else { 0 }).collect();
-            Background::usual(&masked_dataset(&object, 3, Some(mask)), true).unwrap()
+            Background::default_for(&masked_dataset(&object, 3, Some(mask)), true).unwrap()
         };
         let inside = |at: usize| [at % 8, at / 8].iter().all(|i| (1..7).contains(i));
         assert_eq!(masked(&inside), Some(Background::Color([140; 3])));
@@ -407,7 +412,7 @@ mod tests {
         let at_rim = |rim: u8, outside: u8| {
             let value = move |i: usize| if inside(i / 3) { rim } else { outside };
             let mask = (0..64).map(|at| if inside(at) { 255 } else { 0 }).collect();
-            Background::usual(&masked_dataset(&value, 3, Some(mask)), true).unwrap()
+            Background::default_for(&masked_dataset(&value, 3, Some(mask)), true).unwrap()
         };
         assert_eq!(at_rim(130, 150), Some(Background::Color([150; 3])));
         assert_eq!(at_rim(130, 0), Some(Background::Color([130; 3])));
@@ -429,13 +434,13 @@ mod tests {
                 "{name}"
             );
             assert_eq!(changed.render.background, [1.0; 3]);
-            assert!(in_words(&changed).contains("random"));
+            assert!(description(&changed).contains("random"));
         }
         let mut black = recipe("hashgrid");
         Background::Black.apply_to(&mut black);
         assert_eq!(black, recipe("hashgrid"));
         let mut white = recipe("fast");
         Background::White.apply_to(&mut white);
-        assert_eq!(in_words(&white), "white");
+        assert_eq!(description(&white), "white");
     }
 }

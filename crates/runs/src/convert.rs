@@ -3,7 +3,7 @@
 use crate::folder::cameras_beside;
 use crate::levels::write_scene;
 use crate::orbit::orbit;
-use crate::{RunError, check_kept, residual_left_out, scene_of};
+use crate::{RunError, check_not_overwritten, residual_left_out, scene_path};
 use irradia_formats::{SplatFormat, WriteOptions, read_splat_file, read_splats, splat_file_size};
 use irradia_measure::psnr;
 use irradia_scene::{GaussianCloud, Similarity};
@@ -40,8 +40,8 @@ pub struct Conversion {
 pub fn convert(input: &Path, output: &Path, options: &WriteOptions, compares: bool) -> Result<Conversion, RunError> {
     // Reading may take a while: an unknown output format is reported first.
     let to = SplatFormat::of(output)?;
-    check_kept(input, output)?;
-    let input = scene_of(input);
+    check_not_overwritten(input, output)?;
+    let input = scene_path(input);
     let file = read_splat_file(&input)?;
     let before = splat_file_size(&input)?;
     let mut notes = file.warnings();

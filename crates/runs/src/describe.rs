@@ -1,8 +1,8 @@
 //! Descriptions of files and folders.
 
 use crate::RunError;
-use crate::folder::{RESIDUAL, holds_run};
-use crate::scene_file::{is_field, read_field, residual_beside, scene_of};
+use crate::folder::{RESIDUAL, contains_run};
+use crate::scene_file::{is_field, read_field, residual_beside, scene_path};
 use irradia_field::encoding::PositionEncoding;
 use irradia_field::{Field, Outside, Sampler};
 use irradia_formats::{Description, FormatError};
@@ -13,13 +13,13 @@ use std::path::Path;
 /// # Errors
 /// When it does not exist, cannot be read, is none of these, or is a run whose scene has not been written yet.
 pub fn describe(path: impl AsRef<Path>) -> Result<Description, RunError> {
-    let scene = scene_of(path.as_ref());
+    let scene = scene_path(path.as_ref());
     if is_field(&scene) {
         let bytes = std::fs::metadata(&scene).map_or(0, |file| file.len());
         return Ok(describe_field(&read_field(&scene)?, bytes));
     }
     let mut description =
-        irradia_formats::describe(&scene).map_err(|error| match scene.is_dir() && holds_run(&scene) {
+        irradia_formats::describe(&scene).map_err(|error| match scene.is_dir() && contains_run(&scene) {
             true => FormatError::NoScene(scene.clone()),
             false => error,
         })?;

@@ -1,11 +1,11 @@
 //! Edits of a scene on disk: read the scene, apply a list of edits, write the result.
 
-use crate::folder::{SKY, VIGNETTE, cameras_beside, cameras_moved, write_own_cameras};
+use crate::folder::{SKY, VIGNETTE, cameras_beside, moved_cameras_json, write_own_cameras};
 use crate::levels::write_scene;
 use crate::lock::FolderLock;
 use crate::photographs::photographs_of;
-use crate::scene_file::{check_kept, is_field, same_file};
-use crate::{RunError, RunFolder, SCENE, Scene, residual_left_out, scene_of, write_image};
+use crate::scene_file::{check_not_overwritten, is_field, same_file};
+use crate::{RunError, RunFolder, SCENE, Scene, residual_left_out, scene_path, write_image};
 use irradia_edit::{Applied, Draft, Edit, EditList, Provenance, Transform, apply};
 use irradia_formats::{SplatFormat, WriteOptions, read_splat_file, write_atomic, write_splats, write_splats_with};
 use irradia_scene::GaussianCloud;
@@ -24,7 +24,7 @@ pub struct Editing {
     path: PathBuf,
     draft: Draft,
     list: EditList,
-    made: Vec<Made>,
+    applied: Vec<AppliedEdit>,
     /// How the whole scene was moved, in the dataset's coordinates.
     moved: Transform,
     splits: Vec<(String, GaussianCloud)>,
@@ -34,7 +34,7 @@ pub struct Editing {
 
 /// An edit that was made.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Made {
+pub struct AppliedEdit {
     /// The edit, with all automatically determined values written out.
     pub edit: Edit,
     /// Number of selected splats, and of all splats before the edit.
@@ -49,7 +49,7 @@ impl Editing {
     /// # Errors
     /// When it cannot be read, or is a field.
     pub fn open(input: &Path) -> Result<Self, RunError> {
-        let path = scene_of(input);
+        let path = scene_path(input);
         if is_field(&path) {
             let message = format!("{} is a radiance field; only splats can be edited", path.display());
             return Err(RunError::Refused(message));
@@ -64,7 +64,7 @@ impl Editing {
             draft,
             path,
             list: EditList::default(),
-            made: Vec::new(),
+            applied: Vec::new(),
             moved: Transform::IDENTITY,
             splits: Vec::new(),
         })
@@ -81,8 +81,8 @@ impl Editing {
     }
 
     /// What the edits did.
-    pub fn made(&self) -> &[Made] {
-        &self.made
+    pub fn applied(&self) -> &[AppliedEdit] {
+        &self.applied
     }
 
     /// Applies edits in order. Scenes to merge are looked up in the current folder, then beside this scene.
@@ -105,7 +105,7 @@ impl Editing {
             }
             self.splits.extend(split);
             self.list.edits.push(edit.clone());
-            self.made.push(Made {
+            self.applied.push(AppliedEdit {
                 edit,
                 selected: [selected, before],
                 splats: self.draft.len(),
@@ -130,7 +130,7 @@ impl Editing {
             true => output.to_owned(),
             false => output.join(SCENE),
         };
-        check_kept(&self.path, &file)?;
+        check_not_overwritten(&self.path, &file)?;
         if !is_file && output.join("run.json").exists() {
             let message = format!("{} holds a run: name another folder", output.display());
             return Err(RunError::Refused(message));
@@ -140,7 +140,7 @@ impl Editing {
         if !is_file {
             fs::create_dir_all(output).map_err(RunError::io("create", output))?;
             let folder = RunFolder::at(output);
-            let cameras = ("cameras.json", cameras_moved(&self.path, &self.moved));
+            let cameras = ("cameras.json", moved_cameras_json(&self.path, &self.moved));
             // Rendering needs these.
             let others =
                 ["recipe.toml", SKY, VIGNETTE].map(|name| (name, fs::read(self.path.with_file_name(name)).ok()));
@@ -161,7 +161,7 @@ impl Editing {
             notes.extend(write_splats_with(path, cloud, options)?);
             notes.push(format!("{}: {} splats split off", path.display(), cloud.len()));
         }
-        notes.extend(write_scene(&file, &self.draft.shown(), options)?);
+        notes.extend(write_scene(&file, &self.draft.visible_cloud(), options)?);
         if is_file {
             write_own_cameras(&self.path, &file, &self.moved)?;
         }
@@ -190,10 +190,10 @@ impl Editing {
                 "the whole scene would be moved away from its photographs: name another folder with -o".to_owned(),
             );
         }
-        if self.draft.shown().is_empty() {
+        if self.draft.visible_cloud().is_empty() {
             return refused("nothing would be left of the run: name an output with -o".to_owned());
         }
-        let _lock = FolderLock::take(folder.path())?;
+        let _lock = FolderLock::acquire(folder.path())?;
         let mut list = match fs::read_to_string(folder.file(EDITS)) {
             Ok(text) => EditList::parse(&text).map_err(|error| RunError::Damaged {
                 path: folder.file(EDITS),
@@ -216,7 +216,11 @@ impl Editing {
             write_splats(path, cloud)?;
             notes.push(format!("{}: {} splats split off", path.display(), cloud.len()));
         }
-        notes.extend(write_scene(&self.path, &self.draft.shown(), &WriteOptions::default())?);
+        notes.extend(write_scene(
+            &self.path,
+            &self.draft.visible_cloud(),
+            &WriteOptions::default(),
+        )?);
         folder.write(EDITS, list.to_toml().as_bytes())?;
         notes.push("the run's figures are from before the edit: run irradia eval to measure again".to_owned());
         Ok(notes)
@@ -244,7 +248,7 @@ impl Editing {
         let source = |i: usize| total.source(i).filter(|_| !total.changed.contains(i));
         let shown = (0..draft.len()).filter(|i| !draft.hidden.contains(*i));
         let sources: Vec<Option<u32>> = shown.map(source).collect();
-        let splats = Splats::from_cloud(&draft.shown());
+        let splats = Splats::from_cloud(&draft.visible_cloud());
         let bytes = with_splats(&bytes, &splats, &sources).map_err(failed)?;
         write_atomic(path, |out| out.write_all(&bytes))?;
         Ok(sources.iter().flatten().count())
@@ -287,7 +291,7 @@ impl Editing {
         let before = Scene::read(&self.path)?;
         let options = before.options;
         let size = {
-            let k = before.outlook().intrinsics;
+            let k = before.orbit_geometry().intrinsics;
             let factor = (800.0 / k.width.max(k.height) as f32).min(1.0);
             let k = k.scaled(factor);
             (k.width, k.height)
@@ -308,8 +312,8 @@ impl Editing {
 fn open_scene(file: &str, path: &Path) -> Result<GaussianCloud, String> {
     let here = Path::new(file);
     let path = match here.exists() {
-        true => scene_of(here),
-        false => scene_of(&path.with_file_name(file)),
+        true => scene_path(here),
+        false => scene_path(&path.with_file_name(file)),
     };
     Ok(read_splat_file(&path).map_err(|error| error.to_string())?.cloud)
 }

@@ -2,28 +2,36 @@
 
 use crate::RunError;
 use irradia_measure::Evaluation;
-use irradia_scene::Dataset;
+use irradia_scene::{Dataset, View};
 use irradia_train::eval::{EvalOptions, EvaluatedView, evaluate_views, mean};
 use irradia_train::model::Model;
+use rayon::prelude::*;
 use std::collections::HashSet;
 use std::ops::ControlFlow;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 
-/// Renders `model` from the views `indices` of `dataset` and evaluates each with `options`. Passes every view to `see` once it is
+/// In every warning about views without figures.
+pub(crate) const NOT_MEASURED: &str = "not measured";
+
+/// Maximum bytes of the photographs that are decoded at the same time.
+const MAX_DECODED_BYTES: usize = 256 << 20;
+
+/// Renders `model` from the views `indices` of `dataset` and evaluates each with `options`. Passes every view to `on_view` once it is
 /// evaluated; returns the mean over the measured views, NaN if there are none.
 ///
 /// # Errors
-/// When a photograph cannot be read; the error of `see`, which ends the evaluation.
+/// When a photograph cannot be read; the error of `on_view`, which ends the evaluation.
 pub fn evaluate<E: From<RunError>>(
     model: &Model,
     dataset: &Dataset,
     indices: &[usize],
     options: &EvalOptions,
-    mut see: impl FnMut(&EvaluatedView) -> Result<(), E>,
+    mut on_view: impl FnMut(&EvaluatedView) -> Result<(), E>,
 ) -> Result<Evaluation, E> {
     let mut metrics: Vec<Evaluation> = Vec::new();
     let mut outcome = Ok(());
     evaluate_views(model, dataset, indices, options, |view| {
-        outcome = see(&view);
+        outcome = on_view(&view);
         metrics.push(view.metrics);
         if outcome.is_err() {
             ControlFlow::Break(())
@@ -36,20 +44,63 @@ pub fn evaluate<E: From<RunError>>(
     Ok(mean(&metrics))
 }
 
+/// Removes from `views` those whose photographs cannot be decoded, such as files that are damaged behind their headers; returns one line
+/// that names them, or `None` if all can.
+pub fn leave_out_unreadable(dataset: &Dataset, views: &mut Vec<usize>) -> Option<String> {
+    let bytes = |view: &usize| {
+        let View { camera, photo, .. } = &dataset.views[*view];
+        4 * camera.intrinsics.width as usize * camera.intrinsics.height as usize + photo.working_bytes()
+    };
+    let largest = views.iter().map(bytes).max()?;
+    let at_once = (MAX_DECODED_BYTES / largest.max(1)).clamp(1, rayon::current_num_threads());
+    let mut unreadable: Vec<(usize, String)> = Vec::new();
+    for batch in views.chunks(at_once) {
+        let failed = |view: &usize| Some((*view, why_unreadable(&dataset.views[*view])?));
+        unreadable.par_extend(batch.par_iter().filter_map(failed));
+    }
+    let (_, why) = unreadable.first()?;
+    let names = unreadable.iter().map(|(view, _)| dataset.views[*view].name.as_str());
+    let line = format!(
+        "{} of {} views are {NOT_MEASURED}, since their photographs cannot be read: {} ({why})",
+        unreadable.len(),
+        views.len(),
+        names.collect::<Vec<_>>().join(", ")
+    );
+    views.retain(|view| unreadable.iter().all(|(other, _)| other != view));
+    Some(line)
+}
+
+/// [`leave_out_unreadable`] for the held-out views of `dataset`, with a warning; they are not trained on either.
+pub(crate) fn hold_out_readable(dataset: &mut Dataset) {
+    let mut test = std::mem::take(&mut dataset.test);
+    let line = leave_out_unreadable(dataset, &mut test);
+    dataset.test = test;
+    dataset.warnings.extend(line);
+}
+
+/// Why the photograph of `view` cannot be decoded; `None` if it can.
+fn why_unreadable(view: &View) -> Option<String> {
+    // A decoder's panic on a damaged file counts as an error, as in training.
+    match catch_unwind(AssertUnwindSafe(|| view.photo.load())) {
+        Ok(loaded) => loaded.err().map(|error| error.to_string()),
+        Err(_) => Some("the image decoder failed; copy the file again or remove it".to_owned()),
+    }
+}
+
 /// One line about the views that are not measured, given the names of all views and whether each was measured; `None` if all were.
 pub fn unmeasured<'a>(views: impl Iterator<Item = (&'a str, bool)>) -> Option<String> {
-    let (mut all, mut blank) = (0, Vec::new());
+    let (mut all, mut unmeasured_names) = (0, Vec::new());
     for (name, measured) in views {
         all += 1;
         if !measured {
-            blank.push(name);
+            unmeasured_names.push(name);
         }
     }
-    (!blank.is_empty()).then(|| {
-        let names = blank.join(", ");
+    (!unmeasured_names.is_empty()).then(|| {
+        let names = unmeasured_names.join(", ");
         format!(
-            "{} of {all} views are not measured, since their masks exclude all pixels: {names}",
-            blank.len()
+            "{} of {all} views are {NOT_MEASURED}, since their masks exclude all pixels: {names}",
+            unmeasured_names.len()
         )
     })
 }

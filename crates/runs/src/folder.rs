@@ -4,7 +4,7 @@ use crate::edit::EDITS;
 use crate::lock::FolderLock;
 use crate::provenance::ViewList;
 use crate::{RunError, TrainInput};
-use glam::{DVec3, Quat};
+use glam::{DQuat, DVec3, Quat};
 use irradia_edit::Transform;
 use irradia_formats::write_atomic;
 use irradia_scene::{Camera, Dataset, Intrinsics, Pose, Similarity};
@@ -33,6 +33,9 @@ pub const SKY: &str = socket::FILES[3];
 
 /// The length of a run's world unit, if it is known.
 pub const UNIT: &str = "unit.json";
+
+/// The dataset of a run whose photographs were posed for it, in the run's folder.
+pub const POSED_FOLDER: &str = "posed";
 
 /// List of the views of a run's dataset.
 pub(crate) const VIEWS: &str = "views.json";
@@ -68,16 +71,18 @@ const FILES: [&str; 23] = [
     "scene.lod3.ply",
 ];
 /// The subfolders of a run.
-const FOLDERS: [&str; 2] = ["eval", "checkpoints"];
+const SUBFOLDERS: [&str; 2] = ["eval", "checkpoints"];
 
 /// Files written before `run.json`; a run has begun once `run.json` exists.
-const EARLY: [&str; 4] = ["recipe.toml", "cameras.json", VIEWS, WORLD];
+const FILES_BEFORE_RECORD: [&str; 4] = ["recipe.toml", "cameras.json", VIEWS, WORLD];
 
 /// Whether the folder `path` contains a run, or may contain one. False if it contains only files of a process that died before
 /// its run had begun.
-pub(crate) fn holds_run(path: &Path) -> bool {
-    let is_early = |file: &&str| EARLY.contains(file) && FolderLock::was_taken(path);
-    FILES.iter().any(|file| path.join(file).exists() && !is_early(file))
+pub(crate) fn contains_run(path: &Path) -> bool {
+    let is_before_record = |file: &&str| FILES_BEFORE_RECORD.contains(file) && FolderLock::has_lock_file(path);
+    FILES
+        .iter()
+        .any(|file| path.join(file).exists() && !is_before_record(file))
 }
 
 /// The folder of a run.
@@ -92,6 +97,22 @@ pub struct RunRecord {
     pub input: TrainInput,
     /// Whether the recipe was followed to its end and everything was written.
     pub complete: bool,
+}
+
+impl RunRecord {
+    /// The record of the run in `folder`, without paths that are invalid because the run or its list of held-out views was moved.
+    fn parse(text: &[u8], folder: &Path) -> Result<Self, serde_json::Error> {
+        let mut record: Self = serde_json::from_slice(text)?;
+        let (input, posed) = (&mut record.input, folder.join(POSED_FOLDER));
+        if input.data.ends_with(POSED_FOLDER) && !input.data.exists() && posed.is_dir() {
+            input.data = posed;
+        }
+        if input.reading.is_holdout_list_missing() && folder.join(VIEWS).is_file() {
+            // The run knows its held-out views by name: [`RunFolder::restore_holdout`].
+            input.reading.holdout = None;
+        }
+        Ok(record)
+    }
 }
 
 /// A camera in `cameras.json`: enough to orbit the scene later without its photographs.
@@ -136,7 +157,7 @@ impl RunFolder {
     pub fn check_free(path: &Path, overwrite: bool) -> Result<(), RunError> {
         Self::check_replaceable(path, overwrite)?;
         // Before photographs are posed into the folder of a run that is training.
-        FolderLock::take_existing(path).map(drop)
+        FolderLock::acquire_existing(path).map(drop)
     }
 
     /// As [`Self::check_free`], whoever holds the folder.
@@ -147,7 +168,7 @@ impl RunFolder {
                 path.display()
             )));
         }
-        if !overwrite && holds_run(path) {
+        if !overwrite && contains_run(path) {
             let message = format!(
                 "{} already holds a run: choose another --out, --overwrite to replace it, or --resume {0} to resume it",
                 path.display()
@@ -173,11 +194,11 @@ impl RunFolder {
         fs::create_dir_all(path).map_err(no_folder)?;
         let lock = match held {
             Some(lock) => lock,
-            None => FolderLock::take(path)?,
+            None => FolderLock::acquire(path)?,
         };
         Self::check_replaceable(path, overwrite)?;
         if FILES.iter().any(|file| path.join(file).exists()) {
-            for folder in FOLDERS.map(|folder| path.join(folder)) {
+            for folder in SUBFOLDERS.map(|folder| path.join(folder)) {
                 if folder.exists() {
                     fs::remove_dir_all(&folder).map_err(RunError::io("clear", &folder))?;
                 }
@@ -188,7 +209,7 @@ impl RunFolder {
                 }
             }
         }
-        for folder in FOLDERS.map(|folder| path.join(folder)) {
+        for folder in SUBFOLDERS.map(|folder| path.join(folder)) {
             fs::create_dir_all(&folder).map_err(|source| RunError::NoFolder {
                 path: folder.clone(),
                 source,
@@ -205,11 +226,11 @@ impl RunFolder {
     /// When there is no run, or its `run.json` is damaged.
     pub fn open(path: &Path) -> Result<(Self, RunRecord), RunError> {
         let file = path.join("run.json");
-        let text = fs::read_to_string(&file).map_err(|source| RunError::NoRun {
+        let text = fs::read(&file).map_err(|source| RunError::NoRun {
             path: path.to_owned(),
             source,
         })?;
-        let record = serde_json::from_str(&text).map_err(|error| RunError::Damaged {
+        let record = RunRecord::parse(&text, path).map_err(|error| RunError::Damaged {
             path: file,
             reason: error.to_string(),
         })?;
@@ -250,14 +271,14 @@ impl RunFolder {
     }
 
     /// `run.json` of the run that contains the scene `path`, a file or a run's folder; `None` if there is none.
-    pub fn around(path: &Path) -> Option<RunRecord> {
+    pub fn record_containing(path: &Path) -> Option<RunRecord> {
         let folder = if path.is_dir() { path } else { path.parent()? };
-        serde_json::from_slice(&fs::read(folder.join("run.json")).ok()?).ok()
+        RunRecord::parse(&fs::read(folder.join("run.json")).ok()?, folder).ok()
     }
 
     /// Writes the list of training and held-out views.
-    pub(crate) fn write_views(&self, dataset: &Dataset) -> Result<(), RunError> {
-        self.write(VIEWS, &to_json(&ViewList::of(dataset)))
+    pub(crate) fn write_views(&self, views: &ViewList) -> Result<(), RunError> {
+        self.write(VIEWS, &to_json(views))
     }
 
     /// The views with which the run began; `None` if the run has no list.
@@ -273,10 +294,10 @@ impl RunFolder {
         Ok(Some(views))
     }
 
-    /// Differences between `dataset` and the one with which the run began; empty if the run has no list.
-    pub(crate) fn changed_views(&self, dataset: &Dataset) -> Result<Vec<String>, RunError> {
+    /// Differences between the views `now` and those with which the run began; empty if the run has no list.
+    pub(crate) fn changed_views(&self, now: &ViewList) -> Result<Vec<String>, RunError> {
         let then = self.views()?;
-        Ok(then.map_or_else(Vec::new, |then| then.differences(&ViewList::of(dataset))))
+        Ok(then.map_or_else(Vec::new, |then| then.differences(now)))
     }
 
     /// Holds out those views of `dataset` that the run held out, by their names, even if the dataset has gained or lost photographs since:
@@ -284,7 +305,7 @@ impl RunFolder {
     ///
     /// # Errors
     /// When the run's list of views is damaged.
-    pub fn hold_out_again(&self, dataset: &mut Dataset) -> Result<(), RunError> {
+    pub fn restore_holdout(&self, dataset: &mut Dataset) -> Result<(), RunError> {
         if let Some(missing) = self
             .views()?
             .and_then(|views| views.split(dataset))
@@ -309,7 +330,7 @@ impl RunFolder {
 
     /// Removes the temporary files that a killed process left; requires the folder's lock.
     pub(crate) fn remove_leftovers(&self) -> Result<(), RunError> {
-        for folder in FOLDERS.map(|folder| self.file(folder)).iter().chain([&self.0]) {
+        for folder in SUBFOLDERS.map(|folder| self.file(folder)).iter().chain([&self.0]) {
             let entries = fs::read_dir(folder).map_err(RunError::io("read", folder))?;
             for path in entries.filter_map(|entry| Some(entry.ok()?.path())) {
                 let name = path.file_name().unwrap_or_default().to_string_lossy();
@@ -469,19 +490,58 @@ pub(crate) fn world_beside(scene: &Path) -> Result<Similarity, RunError> {
 
 /// The file of the cameras of the scene `scene` alone, such as `scene.edited.cameras.json`. It exists if the scene was moved away from the
 /// photographs of its run, and the cameras with it.
-fn own_cameras(scene: &Path) -> PathBuf {
+fn own_cameras_file(scene: &Path) -> PathBuf {
     scene.with_extension("cameras.json")
 }
 
 /// Whether the file `scene` was moved away from the photographs of the run whose folder contains it.
 pub fn is_moved(scene: &Path) -> bool {
-    own_cameras(scene).is_file()
+    own_cameras_file(scene).is_file()
+}
+
+/// How the whole scene in the file `scene` was moved away from the photographs of the run whose folder contains it, in the dataset's
+/// coordinates: by its own cameras and those of the run.
+pub fn moved_from_run(scene: &Path) -> Transform {
+    let of_run = camera_records(&scene.with_file_name("cameras.json"));
+    match of_run.zip(camera_records(&own_cameras_file(scene))) {
+        Some((before, after)) => moved_between(&before, &after),
+        None => Transform::IDENTITY,
+    }
+}
+
+/// The transform that moves the cameras `before` to where they are `after`. Cameras that are all in one place do not determine a scale.
+fn moved_between(before: &[CameraRecord], after: &[CameraRecord]) -> Transform {
+    let pairs: Vec<_> = before.iter().zip(after).filter(|(a, b)| a.name == b.name).collect();
+    let Some(&(a, b)) = pairs.first() else {
+        return Transform::IDENTITY;
+    };
+    let rotation = |record: &CameraRecord| {
+        let [w, x, y, z] = record.rotation.map(f64::from);
+        DQuat::from_xyzw(x, y, z, w).normalize()
+    };
+    let distance = |from: &CameraRecord, to: &CameraRecord| DVec3::from(from.position).distance(to.position.into());
+    let spread: f64 = pairs.iter().map(|(other, _)| distance(a, other)).sum();
+    let moved_spread: f64 = pairs.iter().map(|(_, other)| distance(b, other)).sum();
+    let turn = Transform {
+        scale: if spread > 0.0 { moved_spread / spread } else { 1.0 },
+        rotation: (rotation(b) * rotation(a).inverse()).normalize(),
+        translation: DVec3::ZERO,
+    };
+    Transform {
+        translation: DVec3::from(b.position) - turn.apply(a.position.into()),
+        ..turn
+    }
+}
+
+/// The cameras in `file`, if it can be read.
+fn camera_records(file: &Path) -> Option<Vec<CameraRecord>> {
+    serde_json::from_slice(&fs::read(file).ok()?).ok()
 }
 
 /// The file of the cameras of `scene`.
 fn cameras_file(scene: &Path) -> PathBuf {
     match is_moved(scene) {
-        true => own_cameras(scene),
+        true => own_cameras_file(scene),
         false => scene.with_file_name("cameras.json"),
     }
 }
@@ -492,10 +552,10 @@ fn cameras_file(scene: &Path) -> PathBuf {
 /// # Errors
 /// When the file cannot be written or removed.
 pub fn write_own_cameras(from: &Path, to: &Path, moved: &Transform) -> Result<(), RunError> {
-    let file = own_cameras(to);
+    let file = own_cameras_file(to);
     let is_in_run = to.with_file_name("cameras.json").is_file();
     let has_own = is_in_run && (is_moved(from) || !moved.is_identity());
-    match has_own.then(|| cameras_moved(from, moved)).flatten() {
+    match has_own.then(|| moved_cameras_json(from, moved)).flatten() {
         Some(text) => Ok(write_atomic(&file, |out| out.write_all(&text))?),
         None if is_in_run && file.is_file() => fs::remove_file(&file).map_err(RunError::io("remove", &file)),
         None => Ok(()),
@@ -504,8 +564,6 @@ pub fn write_own_cameras(from: &Path, to: &Path, moved: &Transform) -> Result<()
 
 /// The cameras of the run that contains the file `scene`, if there is one, in the world of `world_from_dataset`.
 pub(crate) fn cameras_beside(scene: &Path, world_from_dataset: &Similarity) -> Option<Vec<Camera>> {
-    let text = fs::read_to_string(cameras_file(scene)).ok()?;
-    let records: Vec<CameraRecord> = serde_json::from_str(&text).ok()?;
     let camera = |r: &CameraRecord| {
         let [w, x, y, z] = r.rotation;
         let mut k = Intrinsics::from_fov_x(r.width, r.height, 1.0);
@@ -518,18 +576,17 @@ pub(crate) fn cameras_beside(scene: &Path, world_from_dataset: &Similarity) -> O
             k,
         )
     };
-    Some(records.iter().map(camera).collect())
+    Some(camera_records(&cameras_file(scene))?.iter().map(camera).collect())
 }
 
 /// The names of the views of [`cameras_beside`].
 pub(crate) fn camera_names_beside(scene: &Path) -> Option<Vec<String>> {
-    let text = fs::read_to_string(cameras_file(scene)).ok()?;
-    let records: Vec<CameraRecord> = serde_json::from_str(&text).ok()?;
+    let records = camera_records(&cameras_file(scene))?;
     Some(records.into_iter().map(|record| record.name).collect())
 }
 
 /// The content of `cameras.json` beside the file `scene`, if there is one, after moving the whole scene in the dataset's coordinates.
-pub(crate) fn cameras_moved(scene: &Path, moved: &Transform) -> Option<Vec<u8>> {
+pub(crate) fn moved_cameras_json(scene: &Path, moved: &Transform) -> Option<Vec<u8>> {
     let text = fs::read(cameras_file(scene)).ok()?;
     if moved.is_identity() {
         return Some(text);

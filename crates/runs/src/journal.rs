@@ -38,13 +38,13 @@ pub struct Journal {
 }
 
 /// `events.jsonl`, opened for appending.
-fn appended(path: &Path) -> Result<File, RunError> {
+fn open_for_append(path: &Path) -> Result<File, RunError> {
     let file = OpenOptions::new().create(true).append(true).open(path);
     file.map_err(RunError::io("write", path))
 }
 
 /// `pace.txt`, opened for appending after step `from`; later lines of an interrupted run are removed.
-fn kept_paces(folder: &RunFolder, from: u64) -> Result<File, RunError> {
+fn open_paces(folder: &RunFolder, from: u64) -> Result<File, RunError> {
     let path = folder.file(PACES);
     let text = fs::read_to_string(&path).unwrap_or_default();
     let step = |line: &str| line.split_once(' ').and_then(|(step, _)| step.parse::<u64>().ok());
@@ -55,7 +55,7 @@ fn kept_paces(folder: &RunFolder, from: u64) -> Result<File, RunError> {
     if kept.len() < text.len() {
         folder.write(PACES, kept.as_bytes())?;
     }
-    appended(&path)
+    open_for_append(&path)
 }
 
 impl Journal {
@@ -64,13 +64,13 @@ impl Journal {
         let path = folder.file("events.jsonl");
         let mut journal = Self {
             folder: folder.clone(),
-            events: appended(&path)?,
+            events: open_for_append(&path)?,
             curve: Vec::new(),
             stages: Vec::new(),
             warnings: Vec::new(),
             stage_start: 0.0,
             non_finite: 0,
-            paces: kept_paces(folder, from)?,
+            paces: open_paces(folder, from)?,
             pace: None,
             saver: Saver::default(),
             failed: false,
@@ -86,20 +86,20 @@ impl Journal {
             if value["step"].as_u64().is_some_and(|step| step > from) {
                 continue;
             }
-            journal.recall(&value);
+            journal.restore_event(&value);
             kept.push_str(line);
             kept.push('\n');
         }
         // The last line may also have lost its end only, and the next event would continue it.
         if kept != text {
             folder.write("events.jsonl", kept.as_bytes())?;
-            journal.events = appended(&path)?;
+            journal.events = open_for_append(&path)?;
         }
         Ok(journal)
     }
 
     /// Adds an earlier event to the curves.
-    fn recall(&mut self, event: &serde_json::Value) {
+    fn restore_event(&mut self, event: &serde_json::Value) {
         let step = event["step"].as_u64().unwrap_or(0);
         let seconds = event["seconds"].as_f64().unwrap_or(f64::NAN);
         match event["event"].as_str() {
@@ -110,19 +110,19 @@ impl Journal {
                 psnr: None,
                 splats: event["splats"].as_u64().unwrap_or(0),
             }),
-            Some("evaluated") => self.evaluated(
+            Some("evaluated") => self.record_evaluation(
                 step,
                 seconds,
                 event["psnr"].as_f64(),
                 event["splats"].as_u64().unwrap_or(0),
             ),
             Some("warned") => self.warnings.extend(event["message"].as_str().map(str::to_owned)),
-            Some("stage_entered") => self.stage(event["stage"].as_str().unwrap_or("").to_owned(), step, seconds),
+            Some("stage_entered") => self.begin_stage(event["stage"].as_str().unwrap_or("").to_owned(), step, seconds),
             _ => {}
         }
     }
 
-    fn evaluated(&mut self, step: u64, seconds: f64, psnr: Option<f64>, splats: u64) {
+    fn record_evaluation(&mut self, step: u64, seconds: f64, psnr: Option<f64>, splats: u64) {
         match self.curve.last_mut() {
             Some(point) if point.step == step => point.psnr = psnr,
             _ => self.curve.push(CurvePoint {
@@ -135,7 +135,7 @@ impl Journal {
         }
     }
 
-    fn stage(&mut self, name: String, step: u64, seconds: f64) {
+    fn begin_stage(&mut self, name: String, step: u64, seconds: f64) {
         self.end_stage(step, seconds);
         self.stages.push(StageReport {
             name,
@@ -156,20 +156,20 @@ impl Journal {
     fn write(&mut self, event: &Event) {
         let line = serde_json::to_string(event).expect("an event is plain data") + "\n";
         let written = self.events.write_all(line.as_bytes());
-        self.check(written, "events.jsonl");
+        self.report_failure(written, "events.jsonl");
     }
 
     /// Records the pace of a step, if it differs from the previous step's.
-    fn keep_pace(&mut self, step: u64, pace: f64) {
+    fn record_pace(&mut self, step: u64, pace: f64) {
         if self.pace != Some(pace) {
             self.pace = Some(pace);
             let written = self.paces.write_all(Paces::line(step, pace).as_bytes());
-            self.check(written, PACES);
+            self.report_failure(written, PACES);
         }
     }
 
     /// A full disk must not end the training; it is reported once.
-    fn check(&mut self, written: io::Result<()>, file: &str) {
+    fn report_failure(&mut self, written: io::Result<()>, file: &str) {
         if let Err(error) = written
             && !self.failed
         {
@@ -214,9 +214,9 @@ impl Observer for Journal {
         match event {
             Event::Step(report) => {
                 self.non_finite += report.non_finite;
-                self.keep_pace(report.step, report.pace);
-                let apart = (trainer.total_steps() / CURVE_POINTS).max(1);
-                if self.curve.last().is_some_and(|last| report.step < last.step + apart) {
+                self.record_pace(report.step, report.pace);
+                let interval = (trainer.total_steps() / CURVE_POINTS).max(1);
+                if self.curve.last().is_some_and(|last| report.step < last.step + interval) {
                     return Signal::Continue;
                 }
                 self.curve.push(CurvePoint {
@@ -233,8 +233,8 @@ impl Observer for Journal {
                 psnr,
                 splats,
                 ..
-            } => self.evaluated(*step, *seconds, Some(*psnr), *splats as u64),
-            Event::StageEntered { stage, step, seconds } => self.stage(stage.clone(), *step, *seconds),
+            } => self.record_evaluation(*step, *seconds, Some(*psnr), *splats as u64),
+            Event::StageEntered { stage, step, seconds } => self.begin_stage(stage.clone(), *step, *seconds),
             Event::Finished { step, seconds, .. } => self.end_stage(*step, *seconds),
             Event::Warned { message } => self.warnings.push(message.clone()),
             // Not on a GPU, where this would read the state back.

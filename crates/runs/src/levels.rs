@@ -2,7 +2,7 @@
 
 use crate::folder::cameras_beside;
 use crate::orbit::orbit;
-use crate::{RunError, scene_of};
+use crate::{RunError, scene_path};
 use irradia_formats::{SplatFormat, WriteOptions, read_splats, splat_file_size, write_splats_with};
 use irradia_scene::{Camera, GaussianCloud, resize_area};
 use irradia_splat::levels::merged;
@@ -14,9 +14,9 @@ use std::path::{Path, PathBuf};
 /// Number of levels beside a scene; each has half as many splats as the one before.
 pub const LEVELS: u32 = 3;
 /// Maximum number of views in which levels are compared.
-const VIEWS: u32 = 12;
+const MAX_COMPARED_VIEWS: u32 = 12;
 /// Width and height of the compared renders if no cameras are known, pixels.
-const SIZE: (u32, u32) = (640, 480);
+const COMPARED_SIZE: (u32, u32) = (640, 480);
 
 /// A level that was written. Each PSNR compares renders with `1 / 2^level` of the pixels, as seen from correspondingly further away, with
 /// the render of the whole scene at full size, downscaled by area; means over views, dB.
@@ -72,7 +72,7 @@ pub fn write_levels(input: &Path, output: &Path, options: &WriteOptions) -> Resu
     let paths = (1..=LEVELS)
         .map(|level| level_file(output, level))
         .collect::<Result<Vec<_>, _>>()?;
-    let input = scene_of(input);
+    let input = scene_path(input);
     let cloud = read_splats(&input)?;
     let whole = Splats::from_cloud(&cloud);
     let render = RenderOptions {
@@ -149,10 +149,10 @@ pub fn read_levels(path: &Path, count: usize) -> Result<Vec<Splats>, RunError> {
 fn compared_cameras(input: &Path, cloud: &GaussianCloud, splats: &Splats) -> Vec<Camera> {
     match cameras_beside(input, &cloud.world_from_dataset) {
         Some(cameras) if !cameras.is_empty() => {
-            let step = cameras.len().div_ceil(VIEWS as usize);
+            let step = cameras.len().div_ceil(MAX_COMPARED_VIEWS as usize);
             cameras.into_iter().step_by(step).collect()
         }
-        _ => orbit(Some(splats), None, VIEWS, Some(SIZE)),
+        _ => orbit(Some(splats), None, MAX_COMPARED_VIEWS, Some(COMPARED_SIZE)),
     }
 }
 

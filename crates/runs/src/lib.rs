@@ -58,6 +58,7 @@ mod photographs;
 mod pose;
 mod protocol;
 mod provenance;
+mod reading;
 mod request;
 mod results;
 mod run;
@@ -70,30 +71,33 @@ pub use background::Background;
 pub use compact::{CompactEvent, CompactInput, CompactTarget, Compacted, compact};
 pub use convert::{COMPARED_VIEWS, Conversion, convert};
 pub use describe::describe;
-pub use edit::{EDITS, Editing, Made};
+pub use edit::{AppliedEdit, EDITS, Editing};
 pub use error::RunError;
-pub use evaluate::{distinct, evaluate, file_stem, file_stems, unmeasured};
-pub use folder::{FIELD, RESIDUAL, RunFolder, RunRecord, SCENE, is_moved, write_own_cameras};
+pub use evaluate::{distinct, evaluate, file_stem, file_stems, leave_out_unreadable, unmeasured};
+pub use folder::{
+    FIELD, POSED_FOLDER, RESIDUAL, RunFolder, RunRecord, SCENE, is_moved, moved_from_run, write_own_cameras,
+};
 pub use irradia_formats as formats;
 pub use irradia_scene as scene;
 pub use irradia_synth as synth;
 pub use irradia_train as train;
 pub use journal::logged_errors;
 pub use levels::{LEVELS, Level, level_file, read_levels, write_levels};
-pub use orbit::Outlook;
+pub use orbit::OrbitGeometry;
 pub use path::{CameraPath, Film, PathKey};
 pub use photographs::photographs_of;
 pub use pose::{
-    AttemptReport, CameraReport, DoctorInput, DoctorReport, ENOUGH_POSED, Finding, KnownDistance, LeftOutPhoto, Mapper,
-    PoseCheck, PoseInput, PoseProgress, PoseReport, PosesBy, ScaleReport, StageReport, by_reason, check_poses, doctor,
-    is_capture, is_film_name, pose, poses_by,
+    AttemptReport, CameraReport, DoctorInput, DoctorReport, Finding, KnownDistance, LeftOutPhoto, MIN_POSED_FRACTION,
+    Mapper, PoseCheck, PoseInput, PoseProgress, PoseReport, PoseSource, ScaleReport, StageReport, check_poses, doctor,
+    group_by_reason, is_capture, is_film_name, pose, pose_source,
 };
 pub use protocol::Protocol;
 pub use provenance::{data_fingerprint, program_fingerprint};
-pub use request::{DEFAULT_RECIPE, HOW_TO_GET_LPIPS, Reading, TrainInput, TrainRequest, read_recipe};
+pub use reading::{Reading, ReadingOptions};
+pub use request::{DEFAULT_RECIPE, HOW_TO_GET_LPIPS, TrainInput, TrainRequest, read_recipe};
 pub use results::write_image;
 pub use run::{Finished, Run, open_device};
-pub use scene_file::{Scene, check_kept, read_lights, read_vignette, residual_left_out, scene_of};
+pub use scene_file::{Scene, check_not_overwritten, read_lights, read_vignette, residual_left_out, scene_path};
 pub use snapshot::{Snapshot, Snapshots};
 pub use synth_files::{SynthSummary, write_synth_dataset};
 

@@ -6,7 +6,7 @@ use std::io::{Read, Seek, Write};
 use std::path::Path;
 
 /// The locked file. It remains after the run.
-const NAME: &str = ".lock";
+const LOCK_FILE: &str = ".lock";
 
 /// Held while a run may write into its folder.
 ///
@@ -22,8 +22,8 @@ impl FolderLock {
     ///
     /// # Errors
     /// When another process, or another run in this process, holds the lock; when the file cannot be created.
-    pub fn take(folder: &Path) -> Result<Self, RunError> {
-        let path = folder.join(NAME);
+    pub fn acquire(folder: &Path) -> Result<Self, RunError> {
+        let path = folder.join(LOCK_FILE);
         let opened = OpenOptions::new()
             .read(true)
             .write(true)
@@ -51,13 +51,13 @@ impl FolderLock {
     }
 
     /// Whether `folder` was ever locked for a run.
-    pub fn was_taken(folder: &Path) -> bool {
-        folder.join(NAME).is_file()
+    pub fn has_lock_file(folder: &Path) -> bool {
+        folder.join(LOCK_FILE).is_file()
     }
 
-    /// [`Self::take`] if a run has left its lock file. It fails early and creates no file in other folders.
-    pub fn take_existing(folder: &Path) -> Result<Option<Self>, RunError> {
-        Self::was_taken(folder).then(|| Self::take(folder)).transpose()
+    /// [`Self::acquire`] if a run has left its lock file. It fails early and creates no file in other folders.
+    pub fn acquire_existing(folder: &Path) -> Result<Option<Self>, RunError> {
+        Self::has_lock_file(folder).then(|| Self::acquire(folder)).transpose()
     }
 }
 
@@ -68,16 +68,16 @@ mod tests {
     #[test]
     fn there_is_one_holder_at_a_time_and_files_of_dead_processes_are_ignored() {
         let folder = tempfile::tempdir().unwrap();
-        assert!(FolderLock::take_existing(folder.path()).unwrap().is_none());
+        assert!(FolderLock::acquire_existing(folder.path()).unwrap().is_none());
         // As left by a killed process.
-        std::fs::write(folder.path().join(NAME), "4194305").unwrap();
-        let held = FolderLock::take(folder.path()).unwrap();
-        let line = FolderLock::take_existing(folder.path()).unwrap_err().to_string();
+        std::fs::write(folder.path().join(LOCK_FILE), "4194305").unwrap();
+        let held = FolderLock::acquire(folder.path()).unwrap();
+        let line = FolderLock::acquire_existing(folder.path()).unwrap_err().to_string();
         assert!(
             line.contains(&std::process::id().to_string()) && line.contains("--out"),
             "{line}"
         );
         drop(held);
-        FolderLock::take(folder.path()).unwrap();
+        FolderLock::acquire(folder.path()).unwrap();
     }
 }

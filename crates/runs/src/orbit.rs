@@ -10,7 +10,7 @@ use irradia_splat::{Splats, init::focus_point};
 
 /// Where a scene is viewed from.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Outlook {
+pub struct OrbitGeometry {
     /// The focus of the training cameras, the ground below the cameras of a survey, or the middle of most splats; world.
     pub center: Vec3,
     /// Unit vector, derived from how the cameras were held.
@@ -24,10 +24,10 @@ pub struct Outlook {
 }
 
 /// Maximum number of splats that are sampled to find the ground of a survey.
-const SAMPLE: usize = 10_000;
+const MAX_GROUND_SAMPLES: usize = 10_000;
 
-/// The outlook from the training cameras; for a scene without them, from the distribution of its splats.
-pub(crate) fn outlook(splats: Option<&Splats>, cameras: Option<&[Camera]>) -> Outlook {
+/// The geometry from the training cameras; for a scene without them, from the distribution of its splats.
+pub(crate) fn orbit_geometry(splats: Option<&Splats>, cameras: Option<&[Camera]>) -> OrbitGeometry {
     match cameras.filter(|cameras| !cameras.is_empty()) {
         Some(cameras) => {
             let (center, up) = center_and_up(splats, cameras);
@@ -38,7 +38,7 @@ pub(crate) fn outlook(splats: Option<&Splats>, cameras: Option<&[Camera]>) -> Ou
                 (offset - up * offset.dot(up)).length()
             };
             let radius = cameras.iter().map(across).sum::<f32>() / n;
-            Outlook {
+            OrbitGeometry {
                 center,
                 up,
                 radius,
@@ -68,7 +68,7 @@ pub(crate) fn outlook(splats: Option<&Splats>, cameras: Option<&[Camera]>) -> Ou
                 .map(|a| a.1)
                 .chain(sizes.map(|size| 4.0 * size))
                 .fold(1e-3, f32::max);
-            Outlook {
+            OrbitGeometry {
                 center: Vec3::from_array(axes.map(|a| a.0)),
                 // Most files of this kind come from COLMAP, whose y axis points down.
                 up: Vec3::NEG_Y,
@@ -88,7 +88,7 @@ fn center_and_up(splats: Option<&Splats>, cameras: &[Camera]) -> (Vec3, Vec3) {
     };
     let poses: Vec<DPose> = cameras.iter().map(pose).collect();
     let points = splats.into_iter().flat_map(|splats| {
-        let every = splats.len().div_ceil(SAMPLE).max(1);
+        let every = splats.len().div_ceil(MAX_GROUND_SAMPLES).max(1);
         (0..splats.len())
             .step_by(every)
             .map(|i| Vec3::from(splats.mean(i)).as_dvec3())
@@ -103,9 +103,9 @@ fn center_and_up(splats: Option<&Splats>, cameras: &[Camera]) -> (Vec3, Vec3) {
 }
 
 /// A gap between the azimuths of adjacent cameras beyond which that side counts as not photographed, radians.
-const GAP: f32 = FRAC_PI_2;
+const MIN_GAP_RADIANS: f32 = FRAC_PI_2;
 /// Minimum half-width of an arc, for cameras that hardly move, radians.
-const LEAST_HALF: f32 = 0.1;
+const MIN_HALF_WIDTH_RADIANS: f32 = 0.1;
 
 /// The middle and half the width of the arc that contains all `azimuths`, radians; `None` if there is no azimuth, or they are all around.
 fn arc(mut azimuths: Vec<f32>) -> Option<(f32, f32)> {
@@ -118,7 +118,7 @@ fn arc(mut azimuths: Vec<f32>) -> Option<(f32, f32)> {
     let half = 0.5 * (TAU - gap);
     // Between -pi and pi, like the azimuths.
     let middle = (next(last) + half + PI).rem_euclid(TAU) - PI;
-    (gap > GAP).then_some((middle, half.max(LEAST_HALF)))
+    (gap > MIN_GAP_RADIANS).then_some((middle, half.max(MIN_HALF_WIDTH_RADIANS)))
 }
 
 /// A circle around the centre of the scene, at the training cameras' mean distance and height; back and forth on an arc if these are on
@@ -129,13 +129,13 @@ pub(crate) fn orbit(
     frames: u32,
     size: Option<(u32, u32)>,
 ) -> Vec<Camera> {
-    let Outlook {
+    let OrbitGeometry {
         center,
         up,
         radius,
         height,
         mut intrinsics,
-    } = outlook(splats, cameras);
+    } = orbit_geometry(splats, cameras);
     if let Some((width, height)) = size {
         let fov_x = 2.0 * (0.5 * intrinsics.width as f32 / intrinsics.fx).atan();
         intrinsics = Intrinsics::from_fov_x(width, height, fov_x);

@@ -1,11 +1,13 @@
 //! Camera paths: key frames with smooth interpolation between them, and ready-made paths around a scene. The viewer's page has a
-//! twin (`crates/viewer/page/js/path.js`), which saves the files that are read here.
+//! twin (`crates/viewer/page/js/path.js`), which saves the files that are read here. Files are in the coordinates of the photographs, so
+//! that they fit a scene however edits have moved it as a whole.
 //!
 //! Positions and fields of view follow a Catmull-Rom spline whose tangents are the differences of the neighbouring keys divided by those
 //! of their times; rotations are interpolated by squad (Shoemake, "Quaternion calculus and fast animation", 1987).
 
 use crate::{RunError, Scene};
 use glam::{DVec3, Mat3, Quat, Vec3};
+use irradia_edit::Transform;
 use irradia_scene::{Camera, Intrinsics, Pose, Similarity};
 use serde::{Deserialize, Serialize};
 use std::f32::consts::TAU;
@@ -16,22 +18,22 @@ use std::path::Path;
 const MAX_FRAMES: usize = 100_000;
 /// The mean position of the training cameras counts as inside the scene if it is closer to the centre than this fraction of their
 /// distance; that of half a ring is at 0.64.
-const WITHIN: f32 = 0.5;
+const INSIDE_FRACTION: f32 = 0.5;
 /// How far a spiral may move towards the scene's centre, as a fraction of the distance between them: the mean of cameras half around a
 /// scene is close to the subject.
-const NEARER: f32 = 0.3;
+const MAX_APPROACH_FRACTION: f32 = 0.3;
 /// How far a spiral all around a scene rises and falls, in units of its radius.
-const RISES: f32 = 0.3;
+const RISE_FRACTION: f32 = 0.3;
 /// Range of frames per second.
-const FPS: std::ops::RangeInclusive<f32> = 0.1..=240.0;
+const FPS_RANGE: std::ops::RangeInclusive<f32> = 0.1..=240.0;
 
 /// A camera at a point in time.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PathKey {
     /// Seconds from the start.
     pub time: f32,
-    /// Camera centre, world.
-    pub position: [f32; 3],
+    /// Camera centre, world; in a file in the coordinates of the photographs.
+    pub position: [f64; 3],
     /// World from camera (x right, y down, z forward): w, x, y, z.
     pub rotation: [f32; 4],
     /// Vertical field of view, radians.
@@ -82,12 +84,18 @@ pub struct Film {
 }
 
 impl Film {
-    /// Reads a path saved by the viewer, or a `camera_path.json` of nerfstudio in the dataset's coordinates, which `world` maps to those of
-    /// the scene. Frames have `width` x `height` pixels.
+    /// Reads a path saved by the viewer, or a `camera_path.json` of nerfstudio. Both are in the coordinates of the photographs, from which
+    /// the whole scene was `moved` ([`moved_from_run`](crate::moved_from_run)); `world` is the scene's. Frames have `width` x `height`
+    /// pixels.
     ///
     /// # Errors
     /// When the file cannot be read, or is not such a path.
-    pub fn read(path: &Path, world: &Similarity, (width, height): (u32, u32)) -> Result<Self, RunError> {
+    pub fn read(
+        path: &Path,
+        moved: &Transform,
+        world: &Similarity,
+        (width, height): (u32, u32),
+    ) -> Result<Self, RunError> {
         let text = fs::read_to_string(path).map_err(RunError::io("read", path))?;
         let wrong = |reason: &str| RunError::Damaged {
             path: path.to_owned(),
@@ -101,16 +109,17 @@ impl Film {
                 .camera_path
                 .iter()
                 .take(MAX_FRAMES)
-                .map(|c| c.camera(world, width, height))
+                .map(|c| c.camera(moved, world, width, height))
                 .collect();
             let cameras = cameras.filter(|cameras| !cameras.is_empty());
             return Ok(Self {
                 cameras: cameras.ok_or_else(|| wrong("a camera of the path has no valid pose or field of view"))?,
-                fps: file.fps.filter(|fps| FPS.contains(fps)).unwrap_or(30.0),
+                fps: file.fps.filter(|fps| FPS_RANGE.contains(fps)).unwrap_or(30.0),
             });
         }
-        let path: CameraPath =
+        let mut path: CameraPath =
             serde_json::from_value(value).map_err(|error| wrong(&format!("not a camera path: {error}")))?;
+        path.keys.iter_mut().for_each(|key| key.move_to_world(moved, world));
         path.check().map_err(wrong)?;
         Ok(path.film((width, height)))
     }
@@ -127,7 +136,7 @@ impl Film {
     /// path of LLFF (Mildenhall et al. 2019) for forward-facing captures. If the cameras are all around the scene, their mean is inside it,
     /// and the path is two turns of an orbit that rises and falls.
     pub fn spiral(scene: &Scene, frames: u32, size: Option<(u32, u32)>) -> Self {
-        let outlook = scene.outlook();
+        let orbit_geometry = scene.orbit_geometry();
         let around = scene.orbit(32, None);
         let cameras = scene
             .cameras
@@ -135,7 +144,7 @@ impl Film {
             .filter(|cameras| cameras.len() > 1)
             .unwrap_or(&around);
         let center = cameras.iter().map(|c| c.pose.position).sum::<Vec3>() / cameras.len() as f32;
-        let pose = Pose::look_at(center, outlook.center, outlook.up);
+        let pose = Pose::look_at(center, orbit_geometry.center, orbit_geometry.up);
         // The 90th percentile of the cameras' offsets along each axis of the mean camera.
         let radius = |axis: Vec3| {
             let axis = pose.rotation * axis;
@@ -146,17 +155,20 @@ impl Film {
             offsets.sort_unstable_by(f32::total_cmp);
             offsets[(offsets.len() * 9 / 10).min(offsets.len() - 1)]
         };
-        if center.distance(outlook.center) < WITHIN * outlook.radius.hypot(outlook.height) {
-            return Self::rising(scene, frames, size);
+        if center.distance(orbit_geometry.center) < INSIDE_FRACTION * orbit_geometry.radius.hypot(orbit_geometry.height)
+        {
+            return Self::rising_orbit(scene, frames, size);
         }
         let mut radii = Vec3::new(radius(Vec3::X), radius(Vec3::Y), radius(Vec3::Z)) * 0.7;
-        radii.z = radii.z.min(NEARER * center.distance(outlook.center));
-        let intrinsics = sized(outlook.intrinsics, size);
+        radii.z = radii
+            .z
+            .min(MAX_APPROACH_FRACTION * center.distance(orbit_geometry.center));
+        let intrinsics = resized_intrinsics(orbit_geometry.intrinsics, size);
         let camera = |i: u32| {
             let angle = 2.0 * TAU * i as f32 / frames as f32;
             let offset = Vec3::new(angle.cos(), -angle.sin(), -(0.5 * angle).sin()) * radii;
             let eye = center + pose.rotation * offset;
-            Camera::new(Pose::look_at(eye, outlook.center, outlook.up), intrinsics)
+            Camera::new(Pose::look_at(eye, orbit_geometry.center, orbit_geometry.up), intrinsics)
         };
         Self {
             cameras: (0..frames).map(camera).collect(),
@@ -165,13 +177,16 @@ impl Film {
     }
 
     /// `frames` cameras on two turns of a rising and falling orbit, or on its arc.
-    fn rising(scene: &Scene, frames: u32, size: Option<(u32, u32)>) -> Self {
-        let outlook = scene.outlook();
+    fn rising_orbit(scene: &Scene, frames: u32, size: Option<(u32, u32)>) -> Self {
+        let orbit_geometry = scene.orbit_geometry();
         let turn = scene.orbit(frames.div_ceil(2), size);
         let camera = |(i, camera): (u32, &Camera)| {
-            let rise = RISES * outlook.radius * (TAU * i as f32 / frames as f32).sin();
-            let eye = camera.pose.position + rise * outlook.up;
-            Camera::new(Pose::look_at(eye, outlook.center, outlook.up), camera.intrinsics)
+            let rise = RISE_FRACTION * orbit_geometry.radius * (TAU * i as f32 / frames as f32).sin();
+            let eye = camera.pose.position + rise * orbit_geometry.up;
+            Camera::new(
+                Pose::look_at(eye, orbit_geometry.center, orbit_geometry.up),
+                camera.intrinsics,
+            )
         };
         Self {
             cameras: (0..frames).zip(turn.iter().cycle()).map(camera).collect(),
@@ -186,7 +201,7 @@ impl Film {
             let (k, q) = (&camera.intrinsics, camera.pose.rotation);
             PathKey {
                 time: i as f32,
-                position: camera.pose.position.to_array(),
+                position: camera.pose.position.as_dvec3().to_array(),
                 rotation: [q.w, q.x, q.y, q.z],
                 fov: 2.0 * (0.5 * k.height as f32 / k.fy).atan(),
             }
@@ -209,14 +224,24 @@ impl Film {
 }
 
 /// Intrinsics of another size with the same horizontal field of view.
-fn sized(k: Intrinsics, size: Option<(u32, u32)>) -> Intrinsics {
+fn resized_intrinsics(k: Intrinsics, size: Option<(u32, u32)>) -> Intrinsics {
     size.map_or(k, |(width, height)| {
         Intrinsics::from_fov_x(width, height, 2.0 * (0.5 * k.width as f32 / k.fx).atan())
     })
 }
 
+impl PathKey {
+    /// Brings the key from the coordinates of the photographs to the `world` of the scene that was `moved`.
+    fn move_to_world(&mut self, moved: &Transform, world: &Similarity) {
+        let [w, x, y, z] = self.rotation;
+        let rotation = moved.rotation.as_quat() * Quat::from_xyzw(x, y, z, w);
+        self.rotation = [rotation.w, rotation.x, rotation.y, rotation.z];
+        self.position = world.apply(moved.apply(self.position.into())).to_array();
+    }
+}
+
 impl NerfstudioCamera {
-    fn camera(&self, world: &Similarity, width: u32, height: u32) -> Option<Camera> {
+    fn camera(&self, moved: &Transform, world: &Similarity, width: u32, height: u32) -> Option<Camera> {
         let m = &self.camera_to_world;
         if m.len() < 12 || m.iter().any(|v| !v.is_finite()) || !(self.fov > 0.0 && self.fov < 180.0) {
             return None;
@@ -224,16 +249,16 @@ impl NerfstudioCamera {
         let column = |c: usize| DVec3::new(m[c], m[4 + c], m[8 + c]);
         let [x, y, z] = [column(0), -column(1), -column(2)].map(|axis| axis.normalize_or_zero().as_vec3());
         let pose = Pose {
-            rotation: Quat::from_mat3(&Mat3::from_cols(x, y, z)).normalize(),
-            position: world.apply(column(3)).as_vec3(),
+            rotation: (moved.rotation.as_quat() * Quat::from_mat3(&Mat3::from_cols(x, y, z))).normalize(),
+            position: world.apply(moved.apply(column(3))).as_vec3(),
         };
         pose.is_valid()
-            .then(|| seen(pose, self.fov.to_radians(), width, height))
+            .then(|| camera_with_fov(pose, self.fov.to_radians(), width, height))
     }
 }
 
 /// A camera with square pixels and a vertical field of view.
-fn seen(pose: Pose, fov: f32, width: u32, height: u32) -> Camera {
+fn camera_with_fov(pose: Pose, fov: f32, width: u32, height: u32) -> Camera {
     let mut k = Intrinsics::from_fov_x(width, height, 1.0);
     let focal = 0.5 * height as f32 / (0.5 * fov).tan();
     (k.fx, k.fy) = (focal, focal);
@@ -244,7 +269,8 @@ impl CameraPath {
     /// Checks the path; the error says what is wrong.
     fn check(&self) -> Result<(), &'static str> {
         let finite = |key: &PathKey| {
-            let numbers = [key.time, key.fov].into_iter().chain(key.position).chain(key.rotation);
+            let position = key.position.map(|v| v as f32);
+            let numbers = [key.time, key.fov].into_iter().chain(position).chain(key.rotation);
             numbers.into_iter().all(f32::is_finite) && key.rotation.iter().any(|v| *v != 0.0)
         };
         if self.irradia_path != 1 {
@@ -263,7 +289,7 @@ impl CameraPath {
         if self.keys[0].time != 0.0 || self.keys.windows(2).any(|pair| pair[0].time > pair[1].time) {
             return Err("the times of key frames must start at 0 and not decrease");
         }
-        if !FPS.contains(&self.fps) || !(0.0..1e6).contains(&self.closing) {
+        if !FPS_RANGE.contains(&self.fps) || !(0.0..1e6).contains(&self.closing) {
             return Err("frames per second must be 0.1 to 240, and closing 0 to 1,000,000 seconds");
         }
         if self.seconds() * self.fps > MAX_FRAMES as f32 {
@@ -305,9 +331,9 @@ impl CameraPath {
         let [w, x, y, z] = rotation;
         let pose = Pose {
             rotation: Quat::from_xyzw(x, y, z, w).normalize(),
-            position: Vec3::from_array(position),
+            position: DVec3::from(position).as_vec3(),
         };
-        seen(pose, fov, width, height)
+        camera_with_fov(pose, fov, width, height)
     }
 
     /// The interpolated key after `seconds`.
@@ -337,10 +363,11 @@ impl CameraPath {
         let [k0, k1, k2, k3] = [key(i - 1), key(i), key(i + 1), key(i + 2)];
         let span = (k2.time - k1.time).max(1e-9);
         let t = ((time - k1.time) / span).clamp(0.0, 1.0);
-        let spline = |value: &dyn Fn(&PathKey) -> f32| {
+        let spline = |value: &dyn Fn(&PathKey) -> f64| {
             let [p0, p1, p2, p3] = [&k0, &k1, &k2, &k3].map(value);
-            let m1 = span * (p2 - p0) / (k2.time - k0.time).max(1e-9);
-            let m2 = span * (p3 - p1) / (k3.time - k1.time).max(1e-9);
+            let [t, span] = [t, span].map(f64::from);
+            let m1 = span * (p2 - p0) / f64::from((k2.time - k0.time).max(1e-9));
+            let m2 = span * (p3 - p1) / f64::from((k3.time - k1.time).max(1e-9));
             let (t2, t3) = (t * t, t * t * t);
             (2.0 * t3 - 3.0 * t2 + 1.0) * p1 + (t3 - 2.0 * t2 + t) * m1 + (3.0 * t2 - 2.0 * t3) * p2 + (t3 - t2) * m2
         };
@@ -369,7 +396,7 @@ impl CameraPath {
             position: [0, 1, 2].map(|c| spline(&|key: &PathKey| key.position[c])),
             rotation: [rotation.w, rotation.x, rotation.y, rotation.z],
             // Clamped: a field of view that overshoots its keys could turn the image upside down.
-            fov: spline(&|key: &PathKey| key.fov).clamp(k1.fov.min(k2.fov), k1.fov.max(k2.fov)),
+            fov: (spline(&|key: &PathKey| f64::from(key.fov)) as f32).clamp(k1.fov.min(k2.fov), k1.fov.max(k2.fov)),
         }
     }
 }
@@ -408,6 +435,7 @@ fn slerp(a: Quat, b: Quat, t: f32) -> Quat {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use glam::DQuat;
     use irradia_splat::{RenderOptions, Splats};
     use irradia_train::model::Model;
 
@@ -416,7 +444,7 @@ mod tests {
             let q = Quat::from_rotation_y(0.4 * i as f32) * Quat::from_rotation_x(0.1 * (i * i) as f32);
             PathKey {
                 time: 1.5 * i as f32,
-                position: [i as f32, (i * i) as f32 * 0.5, -(i as f32)],
+                position: [i as f64, (i * i) as f64 * 0.5, -(i as f64)],
                 rotation: [q.w, q.x, q.y, q.z],
                 fov: 0.8 + 0.1 * i as f32,
             }
@@ -473,8 +501,9 @@ mod tests {
                 let dot: f32 = at.rotation.iter().zip(key.rotation).map(|(a, b)| a * b).sum();
                 assert!(dot.abs() > 0.99999 && (at.fov - key.fov).abs() < 1e-4);
             }
-            let step = 0.01;
-            let velocity = |time: f32| (path.at(time + step).position[1] - path.at(time).position[1]) / step;
+            let step = 0.01f32;
+            let height = |time: f32| path.at(time).position[1];
+            let velocity = |time: f32| (height(time + step) - height(time)) / f64::from(step);
             for key in &path.keys[1..3] {
                 // No kink: the velocity on both sides of a key is the same.
                 assert!((velocity(key.time) - velocity(key.time - step)).abs() < 0.1);
@@ -502,7 +531,7 @@ mod tests {
         let file = folder.path().join("path.json");
         let write = |text: &str| fs::write(&file, text).expect("written");
         write(&serde_json::to_string(&path(false)).expect("plain data"));
-        let film = Film::read(&file, &Similarity::IDENTITY, (64, 48)).expect("a path");
+        let film = Film::read(&file, &Transform::IDENTITY, &Similarity::IDENTITY, (64, 48)).expect("a path");
         assert_eq!((film.cameras.len(), film.fps), (46, 10.0));
         write(
             r#"{"fps": 24, "render_width": 5, "camera_path": [
@@ -512,15 +541,42 @@ mod tests {
             scale: 0.5,
             center: DVec3::new(1.0, 0.0, -1.0),
         };
-        let scaled = Film::read(&file, &world, (64, 48)).expect("a path").cameras[0];
-        assert_eq!(scaled.pose.position, Vec3::new(1.0, 2.0, 3.0));
-        let film = Film::read(&file, &Similarity::IDENTITY, (64, 48)).expect("a path");
+        let scaled = Film::read(&file, &Transform::IDENTITY, &world, (64, 48)).expect("a path");
+        assert_eq!(scaled.cameras[0].pose.position, Vec3::new(1.0, 2.0, 3.0));
+        let film = Film::read(&file, &Transform::IDENTITY, &Similarity::IDENTITY, (64, 48)).expect("a path");
         let camera = film.cameras[0];
         assert_eq!((film.fps, camera.pose.position), (24.0, Vec3::new(3.0, 4.0, 5.0)));
         // OpenGL looks along -z with y up.
         assert!((camera.pose.rotation * Vec3::Z + Vec3::Z).length() < 1e-5);
         assert!((camera.pose.rotation * Vec3::Y + Vec3::Y).length() < 1e-5);
         assert!((camera.intrinsics.fy - 24.0).abs() < 1e-3);
+    }
+
+    #[test]
+    fn a_saved_path_moves_with_the_scene() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let file = folder.path().join("path.json");
+        let far = DVec3::new(5e6, -4e5, 100.0);
+        let mut saved = path(false);
+        for key in &mut saved.keys {
+            key.position = (far + DVec3::from(key.position)).to_array();
+        }
+        fs::write(&file, serde_json::to_string(&saved).expect("plain data")).expect("written");
+        let turn = DQuat::from_rotation_z(0.7);
+        let moved = Transform::about(far, 2.0, turn);
+        let world = Similarity {
+            scale: 0.1,
+            center: far,
+        };
+        let film = Film::read(&file, &moved, &world, (64, 48)).expect("a path");
+        for (i, camera) in film.cameras.iter().enumerate() {
+            let unmoved = path(false).camera(i as f32 / 10.0, 64, 48);
+            let expected = 0.2 * (turn.as_quat() * unmoved.pose.position);
+            assert!((camera.pose.position - expected).length() < 1e-5, "{i}");
+            let rotation = turn.as_quat() * unmoved.pose.rotation;
+            assert!(rotation.dot(camera.pose.rotation).abs() > 0.99999, "{i}");
+            assert_eq!(camera.intrinsics, unmoved.intrinsics);
+        }
     }
 
     #[test]
@@ -539,9 +595,10 @@ mod tests {
             good.replace("\"time\":4.5", "\"time\":0.5"),
             good.replace("\"irradia_path\":1", "\"irradia_path\":2"),
             good.replacen("\"fov\":0.8", "\"fov\":4", 1),
+            good.replacen("[0.0,0.0,-0.0]", "[1e300,0.0,0.0]", 1),
         ] {
             fs::write(&file, &text).expect("written");
-            let error = Film::read(&file, &Similarity::IDENTITY, (8, 8))
+            let error = Film::read(&file, &Transform::IDENTITY, &Similarity::IDENTITY, (8, 8))
                 .expect_err(&text)
                 .to_string();
             assert!(!error.contains('\n') && error.contains("path.json"), "{error}");

@@ -3,15 +3,15 @@
 use crate::folder::{camera_names_beside, is_moved};
 use crate::scene_file::render_knobs_beside;
 use crate::{RunFolder, TrainInput};
-use irradia_edit::{Photographs, Taken};
+use irradia_edit::{LoadedPhotographs, Photographs};
 use irradia_scene::Photo;
 use rayon::prelude::*;
 use std::path::Path;
 
 /// Longer side, pixels. At much smaller sizes renders would differ from those in training, since splats are widened to a pixel.
-const SIDE: f32 = 480.0;
+const MAX_SIDE: f32 = 480.0;
 /// Maximum number of photographs, spread evenly over the cameras.
-const MOST: usize = 24;
+const MAX_PHOTOS: usize = 24;
 
 /// The photographs on which the scene `scene` was trained, if it is in its run's folder, was not moved away from them, and they are still
 /// in place.
@@ -21,7 +21,7 @@ pub fn photographs_of(scene: &Path) -> Option<Photographs> {
     Some(Photographs::new(move || read(&scene)))
 }
 
-fn read(scene: &Path) -> Option<Taken> {
+fn read(scene: &Path) -> Option<LoadedPhotographs> {
     let input = TrainInput::of_run(scene.parent()?).ok()?;
     let dataset = input.reading.read(&input.data).ok()?;
     // The scene's cameras are pinholes: photographs with distortion or a rolling shutter do not match them.
@@ -30,14 +30,14 @@ fn read(scene: &Path) -> Option<Taken> {
     }
     let background = render_knobs_beside(scene).background;
     let names = camera_names_beside(scene)?;
-    let step = names.len().div_ceil(MOST).max(1);
+    let step = names.len().div_ceil(MAX_PHOTOS).max(1);
     let photos: Option<Vec<(usize, Photo)>> = (0..names.len())
         .into_par_iter()
         .step_by(step)
         .map(|camera| {
             let view = dataset.views.iter().find(|view| view.name == names[camera])?;
             let k = view.camera.intrinsics;
-            let small = k.scaled((SIDE / k.width.max(k.height) as f32).min(1.0));
+            let small = k.scaled((MAX_SIDE / k.width.max(k.height) as f32).min(1.0));
             let photo = view.photo.load_at(small.width, small.height).ok()?;
             let data = photo.over(background);
             Some((
@@ -50,7 +50,7 @@ fn read(scene: &Path) -> Option<Taken> {
             ))
         })
         .collect();
-    Some(Taken {
+    Some(LoadedPhotographs {
         photos: photos?,
         background,
     })

@@ -19,7 +19,7 @@ pub enum Protocol {
 }
 
 /// The indoor scenes of mip-NeRF 360.
-const INDOOR: [&str; 4] = ["room", "counter", "kitchen", "bonsai"];
+const INDOOR_SCENES: [&str; 4] = ["room", "counter", "kitchen", "bonsai"];
 
 impl Protocol {
     /// All protocols.
@@ -41,7 +41,7 @@ impl Protocol {
         let (downscale, holdout) = match self {
             Protocol::Blender => (1.0, None),
             Protocol::Llff => (4.0, every_8th),
-            Protocol::MipNerf360 if INDOOR.contains(&scene) => (2.0, every_8th),
+            Protocol::MipNerf360 if INDOOR_SCENES.contains(&scene) => (2.0, every_8th),
             Protocol::MipNerf360 => (4.0, every_8th),
             Protocol::TandT => (1.0, every_8th),
         };
@@ -63,7 +63,7 @@ impl Protocol {
         match self {
             Protocol::Blender => [800, 800],
             Protocol::Llff => [1008, 1008],
-            Protocol::MipNerf360 if INDOOR.contains(&scene) => [1556, 1560],
+            Protocol::MipNerf360 if INDOOR_SCENES.contains(&scene) => [1556, 1560],
             Protocol::MipNerf360 => [1236, 1298],
             Protocol::TandT => [976, 984],
         }

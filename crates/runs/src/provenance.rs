@@ -14,12 +14,12 @@ pub(crate) struct ViewList(BTreeMap<String, ViewRecord>);
 struct ViewRecord {
     width: u32,
     height: u32,
-    part: Part,
+    part: SplitPart,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-enum Part {
+enum SplitPart {
     Train,
     Test,
     Neither,
@@ -27,10 +27,10 @@ enum Part {
 
 impl ViewList {
     pub fn of(dataset: &Dataset) -> Self {
-        let mut parts = vec![Part::Neither; dataset.views.len()];
-        dataset.train.iter().for_each(|i| parts[*i] = Part::Train);
-        dataset.test.iter().for_each(|i| parts[*i] = Part::Test);
-        let record = |(view, part): (&irradia_scene::View, Part)| {
+        let mut parts = vec![SplitPart::Neither; dataset.views.len()];
+        dataset.train.iter().for_each(|i| parts[*i] = SplitPart::Train);
+        dataset.test.iter().for_each(|i| parts[*i] = SplitPart::Test);
+        let record = |(view, part): (&irradia_scene::View, SplitPart)| {
             let k = &view.camera.intrinsics;
             let (width, height) = (k.width, k.height);
             (view.name.clone(), ViewRecord { width, height, part })
@@ -44,11 +44,11 @@ impl ViewList {
         let part = |view: usize| self.0.get(&dataset.views[view].name).map(|record| record.part);
         let views = || 0..dataset.views.len();
         views().find_map(part)?;
-        let test: Vec<usize> = views().filter(|view| part(*view) == Some(Part::Test)).collect();
+        let test: Vec<usize> = views().filter(|view| part(*view) == Some(SplitPart::Test)).collect();
         let train = views()
-            .filter(|view| !matches!(part(*view), Some(Part::Test | Part::Neither)))
+            .filter(|view| !matches!(part(*view), Some(SplitPart::Test | SplitPart::Neither)))
             .collect();
-        let held_out = self.0.values().filter(|record| record.part == Part::Test).count();
+        let held_out = self.0.values().filter(|record| record.part == SplitPart::Test).count();
         let missing = held_out - test.len();
         (dataset.train, dataset.test) = (train, test);
         Some(missing)
@@ -56,17 +56,17 @@ impl ViewList {
 
     /// Differences from `now`: one phrase per kind of difference, each with the first view concerned.
     pub fn differences(&self, now: &Self) -> Vec<String> {
-        let told = |what: &str, names: Vec<&String>| {
+        let phrase = |what: &str, names: Vec<&String>| {
             let first = names.first()?;
             Some(format!("{} {what}, such as {first}", names.len()))
         };
-        let lacking = |of: &Self, from: &Self| -> Vec<String> {
+        let missing_from = |of: &Self, from: &Self| -> Vec<String> {
             of.0.keys()
                 .filter(|name| !from.0.contains_key(*name))
                 .cloned()
                 .collect()
         };
-        let (gone, new) = (lacking(self, now), lacking(now, self));
+        let (gone, new) = (missing_from(self, now), missing_from(now, self));
         let both = || {
             self.0
                 .iter()
@@ -75,10 +75,10 @@ impl ViewList {
         let sizes = both().filter(|(_, a, b)| (a.width, a.height) != (b.width, b.height));
         let parts = both().filter(|(_, a, b)| a.part != b.part);
         [
-            told("views are gone", gone.iter().collect()),
-            told("views are new", new.iter().collect()),
-            told("views have another size", sizes.map(|(name, ..)| name).collect()),
-            told(
+            phrase("views are gone", gone.iter().collect()),
+            phrase("views are new", new.iter().collect()),
+            phrase("views have another size", sizes.map(|(name, ..)| name).collect()),
+            phrase(
                 "views changed between training and held out",
                 parts.map(|(name, ..)| name).collect(),
             ),

@@ -1,11 +1,9 @@
 //! Training requests: raw input, and the validated request.
 
-use crate::pose::{are_missing, find_points};
-use crate::{Background, RunError, RunFolder, is_moved, scene_of};
+use crate::pose::{find_points, lacks_points};
+use crate::{Background, Reading, RunError, RunFolder, is_moved, scene_path};
 use irradia_compute::DeviceChoice;
-use irradia_formats::{
-    DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, Lenses, Readout, read_dataset, read_splats,
-};
+use irradia_formats::{DEFAULT_MAX_SIDE, DatasetOptions, Lenses, read_dataset, read_splats};
 use irradia_scene::{Dataset, sh};
 use irradia_splat::Splats;
 use irradia_train::Recipe;
@@ -25,142 +23,7 @@ pub const HOW_TO_GET_LPIPS: &str = "import the weights once with irradia lpips -
 pub const DEFAULT_RECIPE: &str = "fast";
 
 /// Maximum factor by which many photographs lengthen a recipe: 30,000 steps of `fast`, as many as 3DGS makes.
-const MOST_STRETCHED: u64 = 10;
-
-/// How to read a dataset, not validated.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Reading {
-    /// The name of a [`DatasetFormat`], such as `colmap`; detected from the folder if `None`.
-    #[serde(default)]
-    pub format: Option<String>,
-    /// The images' sides are divided by this; 1 or more.
-    pub downscale: f32,
-    /// Maximum number of pixels of an image's longer side; at least 1, and not together with `downscale`, which replaces the
-    /// default limit. `None`: full size.
-    #[serde(default)]
-    pub max_side: Option<u32>,
-    /// Views to hold out: every N-th in the order of names (`8`), none (`0`), or those listed in a file, one per line.
-    /// `None`: those that the dataset itself holds out, every 8th if it does not define any.
-    #[serde(default)]
-    pub holdout: Option<String>,
-    /// The folder of the photographs, if it is not where the layout expects it.
-    #[serde(default)]
-    pub images: Option<PathBuf>,
-    /// How distorted photographs are handled.
-    #[serde(default)]
-    pub lenses: Lenses,
-    /// The readout of the film whose frames the photographs are, in the form of [`Readout`].
-    #[serde(default)]
-    pub readout: Option<String>,
-}
-
-impl Default for Reading {
-    /// Any format, the dataset's own split, at most [`DEFAULT_MAX_SIDE`] pixels per side.
-    fn default() -> Self {
-        Self {
-            format: None,
-            downscale: 1.0,
-            max_side: Some(DEFAULT_MAX_SIDE),
-            holdout: None,
-            images: None,
-            lenses: Lenses::default(),
-            readout: None,
-        }
-    }
-}
-
-impl Reading {
-    /// The validated options.
-    ///
-    /// # Errors
-    /// [`RunError::Setting`] for a value out of range.
-    pub fn check(&self) -> Result<DatasetOptions, RunError> {
-        let format: Option<DatasetFormat> = match &self.format {
-            Some(name) => Some(
-                name.parse()
-                    .map_err(|e| RunError::setting("format", name, format!("{e}")))?,
-            ),
-            None => None,
-        };
-        let readout: Option<Readout> = match &self.readout {
-            Some(text) => Some(text.parse().map_err(|e| RunError::setting("readout", text, e))?),
-            None => None,
-        };
-        if !self.downscale.is_finite() || self.downscale < 1.0 {
-            return Err(RunError::setting("downscale", self.downscale, "must be 1 or more"));
-        }
-        if self.max_side == Some(0) {
-            return Err(RunError::setting("max_side", 0, "must be 1 or more"));
-        }
-        // An explicit downscale replaces the default limit.
-        let max_side = self
-            .max_side
-            .filter(|side| self.downscale == 1.0 || *side != DEFAULT_MAX_SIDE);
-        if let Some(side) = max_side.filter(|_| self.downscale != 1.0) {
-            return Err(RunError::setting("max_side", side, "cannot be combined with downscale"));
-        }
-        Ok(DatasetOptions {
-            format,
-            downscale: self.downscale,
-            max_side,
-            holdout: self.holdout()?,
-            images: self.images.clone(),
-            lenses: self.lenses,
-            readout,
-        })
-    }
-
-    /// These settings over those of a run: where they are the defaults, those of `run` apply.
-    pub fn over(&self, run: Self) -> Self {
-        let default = Self::default();
-        let is_scaled = self.downscale != default.downscale || self.max_side != default.max_side;
-        let size = if is_scaled { self } else { &run };
-        Self {
-            downscale: size.downscale,
-            max_side: size.max_side,
-            format: self.format.clone().or(run.format),
-            holdout: self.holdout.clone().or(run.holdout),
-            images: self.images.clone().or(run.images),
-            lenses: if self.lenses == default.lenses {
-                run.lenses
-            } else {
-                self.lenses
-            },
-            readout: self.readout.clone().or(run.readout),
-        }
-    }
-
-    fn holdout(&self) -> Result<Holdout, RunError> {
-        let Some(text) = &self.holdout else {
-            return Ok(Holdout::AsDeclared);
-        };
-        let wrong = |message: &str| Err(RunError::setting("holdout", text, message));
-        match text.parse::<usize>() {
-            Ok(0) => Ok(Holdout::Nothing),
-            Ok(1) => wrong("every view would be held out; must be 2 or more, or 0 to train on all"),
-            Ok(n) => Ok(Holdout::Every(n)),
-            Err(_) if Path::new(text).is_file() => Ok(Holdout::Listed(text.into())),
-            Err(_) => wrong("expected a number, 0 to train on all views, or a file that lists the views to hold out"),
-        }
-    }
-
-    /// Makes the paths in `holdout` and `images` absolute.
-    fn with_absolute_paths(mut self) -> Self {
-        self.images = self.images.map(absolute);
-        if let Ok(Holdout::Listed(file)) = self.holdout() {
-            self.holdout = Some(absolute(file).display().to_string());
-        }
-        self
-    }
-
-    /// Reads the dataset at `path`; the caller shows its `warnings`.
-    ///
-    /// # Errors
-    /// When a value is out of range, or `path` contains no dataset.
-    pub fn read(&self, path: &Path) -> Result<Dataset, RunError> {
-        Ok(read_dataset(path, &self.check()?)?)
-    }
-}
+const MAX_LENGTH_FACTOR: u64 = 10;
 
 /// A training request, not validated; stored in `run.json`. A new option is a field here, with its bounds in
 /// [`TrainInput::check`].
@@ -214,7 +77,7 @@ pub struct TrainInput {
     /// How the dataset is read.
     #[serde(flatten)]
     pub reading: Reading,
-    /// The background of the scene. `None`: what [`Background::usual`] finds in the photographs, otherwise the recipe's.
+    /// The background of the scene. `None`: what [`Background::default_for`] finds in the photographs, otherwise the recipe's.
     #[serde(default)]
     pub background: Option<Background>,
     /// A scene with whose splats the training begins: a file or a run's folder, in the coordinates of the dataset.
@@ -265,7 +128,8 @@ impl TrainInput {
         }
     }
 
-    /// The request of the run in the folder `out`, to resume it: its recipe is the resolved one in that folder. The dataset, limits
+    /// The request of the run in the folder `out`, to resume it: its recipe is the resolved one in that folder. Photographs that were posed
+    /// for the run are found in it wherever it was moved, and without its list of held-out views these are known by name. The dataset, limits
     /// and weights may be changed before [`TrainInput::check`].
     ///
     /// # Errors
@@ -354,7 +218,7 @@ impl TrainInput {
     }
 }
 
-fn absolute(path: PathBuf) -> PathBuf {
+pub(crate) fn absolute(path: PathBuf) -> PathBuf {
     std::path::absolute(&path).unwrap_or(path)
 }
 
@@ -380,8 +244,8 @@ pub fn read_recipe(name: &str, overrides: &[String]) -> Result<Recipe, RunError>
 
 /// Whether the recipe's loss contains LPIPS at any time.
 pub(crate) fn has_perceptual_loss(recipe: &Recipe) -> bool {
-    let weighs = |moment: &OutlinePoint| moment.values[Param::PerceptualWeight] > 0.0;
-    outline(recipe, 1000).iter().any(weighs)
+    let has_perceptual_weight = |moment: &OutlinePoint| moment.values[Param::PerceptualWeight] > 0.0;
+    outline(recipe, 1000).iter().any(has_perceptual_weight)
 }
 
 /// A validated request, created by [`TrainInput::check`]; one request is one run.
@@ -415,14 +279,14 @@ impl TrainRequest {
 
     /// Whether a run on `dataset` finds points by matching its photographs, which takes a moment per photograph: it does if the dataset has
     /// no points and no initial splats are given. Rendered scenes need no points, since their alpha shows what is empty.
-    pub fn matches_points(&self, dataset: &Dataset) -> bool {
-        self.input.match_points && self.input.from.is_none() && are_missing(dataset)
+    pub fn should_match_points(&self, dataset: &Dataset) -> bool {
+        self.input.match_points && self.input.from.is_none() && lacks_points(dataset)
     }
 
-    /// `dataset`, with points added if [`Self::matches_points`], and a message about what was found. The points are the same for any
+    /// `dataset`, with points added if [`Self::should_match_points`], and a message about what was found. The points are the same for any
     /// number of threads.
     pub(crate) fn with_points(&self, mut dataset: Dataset) -> (Dataset, Option<String>) {
-        if !self.matches_points(&dataset) {
+        if !self.should_match_points(&dataset) {
             return (dataset, None);
         }
         // Small images show fewer features, and matching needs pinholes.
@@ -457,7 +321,7 @@ impl TrainRequest {
 
     /// If neither steps, budget nor replay are given, puts the recipe's changes for such runs before those of the input, which take
     /// precedence.
-    pub(crate) fn choose_changes(&mut self) -> Result<(), RunError> {
+    pub(crate) fn apply_unhurried_changes(&mut self) -> Result<(), RunError> {
         let input = &mut self.input;
         let is_free = input.steps.is_none() && input.budget.is_none() && input.replay.is_none();
         if is_free && !self.recipe.unhurried.is_empty() {
@@ -474,7 +338,7 @@ impl TrainRequest {
         let wanted = self.recipe.visits.saturating_mul(dataset.train.len() as u64);
         let input = &mut self.input;
         if wanted > own && input.steps.is_none() && input.budget.is_none() && input.replay.is_none() {
-            input.steps = Some(wanted.min(MOST_STRETCHED * own));
+            input.steps = Some(wanted.min(MAX_LENGTH_FACTOR * own));
         }
     }
 
@@ -494,7 +358,7 @@ impl TrainRequest {
                 self.recipe.unset(Param::CoverWeight);
             } else {
                 let covers = self.recipe.uses(Param::CoverWeight);
-                self.input.background = Background::usual(dataset, covers)?;
+                self.input.background = Background::default_for(dataset, covers)?;
             }
         }
         if let Some(background) = self.input.background {
@@ -504,9 +368,9 @@ impl TrainRequest {
     }
 
     /// The initial splats, in the world of `dataset`, with room for all SH bands, and whether they need antialiasing.
-    pub(crate) fn first_splats(&self, dataset: &Dataset) -> Result<Option<(Splats, bool)>, RunError> {
+    pub(crate) fn initial_splats(&self, dataset: &Dataset) -> Result<Option<(Splats, bool)>, RunError> {
         let Some(from) = &self.input.from else { return Ok(None) };
-        let path = scene_of(from);
+        let path = scene_path(from);
         if is_moved(&path) {
             return Err(RunError::Refused(format!(
                 "{} was moved away from its photographs: start from a scene whose edits do not move all of it",
@@ -554,7 +418,7 @@ mod tests {
             input.recipe = "hashgrid".into();
             change(&mut input);
             let mut request = input.check().expect("valid");
-            request.choose_changes().expect("valid");
+            request.apply_unhurried_changes().expect("valid");
             let encoding = request.recipe.field.as_ref().expect("a field").net.encoding;
             (
                 format!("{encoding:?}").contains("finest: 1024"),

@@ -1,5 +1,6 @@
 //! The results of a finished run: its scene, the held-out views, and the report.
 
+use crate::evaluate::NOT_MEASURED;
 use crate::folder::{FIELD, SCENE, to_json};
 use crate::levels::write_scene;
 use crate::request::has_perceptual_loss;
@@ -13,7 +14,7 @@ use irradia_train::eval::{EvalOptions, EvaluatedView, Metrics};
 use irradia_train::field_file;
 use irradia_train::model::Model;
 use irradia_train::report::{
-    Beside, Breakdown, Inside, Report, ViewReport, machine, peak_rss_bytes, schedule, to_html,
+    Breakdown, InsideLoop, OutsideLoop, Report, ViewReport, machine, peak_rss_bytes, schedule, to_html,
 };
 use irradia_train::socket::Vignette;
 use rayon::prelude::*;
@@ -81,7 +82,8 @@ impl Run {
         warnings.extend(unmeasured(
             views.iter().map(|view| (view.name.as_str(), !view.psnr.is_nan())),
         ));
-        if trainer.dataset.test.is_empty() && !warnings.iter().any(|line| line.contains(NOTHING_HELD_OUT)) {
+        let is_explained = |line: &String| line.contains(NOTHING_HELD_OUT) || line.contains(NOT_MEASURED);
+        if trainer.dataset.test.is_empty() && !warnings.iter().any(is_explained) {
             warnings.push(format!("{NOTHING_HELD_OUT}: nothing was evaluated"));
         }
         Ok(Report {
@@ -96,8 +98,8 @@ impl Run {
             seconds: trainer.times.wall,
             training_seconds: trainer.seconds,
             breakdown: Breakdown {
-                inside: Inside::of(&trainer.times, trainer.seconds),
-                beside: Beside {
+                inside: InsideLoop::of(&trainer.times, trainer.seconds),
+                beside: OutsideLoop {
                     preparing: self.preparing.unwrap_or(0.0),
                     finishing: finishing.elapsed().as_secs_f64(),
                 },
@@ -117,7 +119,7 @@ impl Run {
             trained_on_lpips: name_of(networks.first).filter(|_| has_perceptual_loss(&trainer.recipe)),
             psnr_corrected: mean.psnr_corrected,
             half_fit_psnr: mean.half_fit_psnr,
-            corner_brightness: trainer.sockets.vignette.as_ref().and_then(Vignette::corner),
+            corner_brightness: trainer.sockets.vignette.as_ref().and_then(Vignette::corner_gain),
             views,
             schedule: schedule(
                 &trainer.recipe,

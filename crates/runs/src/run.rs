@@ -1,15 +1,17 @@
 //! A training run with its folder: begin or resume, train, finish.
 
+use crate::evaluate::hold_out_readable;
 use crate::folder::RunRecord;
 use crate::journal::Journal;
 use crate::lock::FolderLock;
+use crate::provenance::ViewList;
 use crate::snapshot::{SnapshotServer, Snapshots};
 use crate::{RunError, RunFolder, TrainRequest, background};
 use irradia_compute::{Device, DeviceChoice};
 use irradia_measure::Lpips;
 use irradia_scene::Dataset;
 use irradia_train::event::Observer;
-use irradia_train::memory::usual_limit;
+use irradia_train::memory::default_limit;
 use irradia_train::paces::Paces;
 use irradia_train::report::Report;
 use irradia_train::{RunLimits, TrainOptions, Trainer, checkpoint};
@@ -78,33 +80,37 @@ impl Run {
     /// # Errors
     /// Those of [`Run::begin`].
     pub fn begin_on(mut request: TrainRequest, mut dataset: Dataset) -> Result<Self, RunError> {
-        if let (Some(from), None) = (&request.input.from, &request.input.reading.holdout)
-            && let Some(run) = RunFolder::containing(from)
+        let earlier = request.input.replay.as_ref().or(request.input.from.as_ref());
+        if let (Some(earlier), None) = (earlier, &request.input.reading.holdout)
+            && let Some(run) = RunFolder::containing(earlier)
         {
-            // The splats were trained on all others.
-            run.hold_out_again(&mut dataset)?;
+            // The splats were trained on all others, or are to be trained again on the same ones.
+            run.restore_holdout(&mut dataset)?;
         }
+        // Before unreadable photographs are left out: once they are restored, they are held out again.
+        let views = ViewList::of(&dataset);
+        hold_out_readable(&mut dataset);
         if dataset.test.is_empty()
             && let Some(psnr) = request.input.until_psnr
         {
-            let message = "no view is held out, so PSNR cannot be measured";
+            let message = "no view is held out, or none can be read, so PSNR cannot be measured";
             return Err(RunError::setting("until_psnr", psnr, message));
         }
-        request.choose_changes()?;
+        request.apply_unhurried_changes()?;
         request.choose_background(&dataset)?;
         request.choose_length(&dataset);
         let (out, overwrite) = (&request.input.out, request.input.overwrite);
         RunFolder::check_replaceable(out, overwrite)?;
-        let held = FolderLock::take_existing(out)?;
+        let existing_lock = FolderLock::acquire_existing(out)?;
         let paces = request.paces()?;
         let options = train_options(&request)?;
         let (dataset, found) = request.with_points(dataset);
-        let mut trainer = first_trainer(&request, Arc::new(dataset), options)?;
-        found.into_iter().for_each(|message| trainer.tell(message));
-        let (folder, lock) = RunFolder::create(out, overwrite, held)?;
+        let mut trainer = new_trainer(&request, Arc::new(dataset), options)?;
+        found.into_iter().for_each(|message| trainer.add_decision(message));
+        let (folder, lock) = RunFolder::create(out, overwrite, existing_lock)?;
         folder.write("recipe.toml", trainer.recipe.to_toml().as_bytes())?;
         folder.write_cameras(&trainer)?;
-        folder.write_views(&trainer.dataset)?;
+        folder.write_views(&views)?;
         folder.write_world(&trainer.dataset.world_from_dataset)?;
         // Last: a folder with this file has everything needed to resume.
         folder.write_record(&RunRecord {
@@ -118,8 +124,8 @@ impl Run {
     /// [`TrainInput::of_run`](crate::TrainInput::of_run).
     ///
     /// # Errors
-    /// When the folder contains no run or is in use, its checkpoint is damaged, or its dataset cannot be read or has different
-    /// views from those of the previous steps.
+    /// When the folder contains no run or is in use, its checkpoint is damaged, its dataset cannot be read or has different views from
+    /// those of the previous steps, or the request holds out others.
     pub fn resume(request: TrainRequest) -> Result<Self, RunError> {
         let dataset = request.read_dataset()?;
         Self::resume_on(request, dataset)
@@ -130,11 +136,14 @@ impl Run {
     /// # Errors
     /// Those of [`Run::resume`].
     pub fn resume_on(request: TrainRequest, mut dataset: Dataset) -> Result<Self, RunError> {
-        let (folder, _) = RunFolder::open(&request.input.out)?;
-        if request.input.from.is_some() && request.input.reading.holdout.is_none() {
-            folder.hold_out_again(&mut dataset)?;
+        let (folder, record) = RunFolder::open(&request.input.out)?;
+        let holdout = &request.input.reading.holdout;
+        if holdout.is_none() {
+            folder.restore_holdout(&mut dataset)?;
         }
-        let lock = FolderLock::take(folder.path())?;
+        let views = ViewList::of(&dataset);
+        hold_out_readable(&mut dataset);
+        let lock = FolderLock::acquire(folder.path())?;
         folder.remove_leftovers()?;
         let options = train_options(&request)?;
         let paces = request.paces()?;
@@ -143,20 +152,28 @@ impl Run {
         let dataset = Arc::new(dataset);
         let trainer = match folder.newest_checkpoint()? {
             Some(path) => {
-                let differences = folder.changed_views(&dataset)?;
+                let differences = folder.changed_views(&views)?.join("; ");
+                if let Some(requested) = holdout
+                    && *holdout != record.input.reading.holdout
+                    && !differences.is_empty()
+                {
+                    let message =
+                        format!("the run holds out other views ({differences}): omit it to hold out the same ones");
+                    return Err(RunError::setting("holdout", requested, message));
+                }
                 if !differences.is_empty() {
                     return Err(RunError::DataChanged {
                         folder: folder.path().to_owned(),
                         data: request.input.data.clone(),
-                        differences: differences.join("; "),
+                        differences,
                     });
                 }
                 read_checkpoint(&path, dataset, options)?
             }
             // Interrupted before its first checkpoint: no step depends on the earlier data.
-            None => first_trainer(&request, dataset, options)?,
+            None => new_trainer(&request, dataset, options)?,
         };
-        folder.write_views(&trainer.dataset)?;
+        folder.write_views(&views)?;
         Self::new(folder, lock, request, trainer, paces)
     }
 
@@ -196,7 +213,7 @@ impl Run {
 
     /// Description of the training and evaluation background.
     pub fn background(&self) -> String {
-        background::in_words(&self.trainer.recipe)
+        background::description(&self.trainer.recipe)
     }
 
     /// The folder.
@@ -289,9 +306,9 @@ impl Run {
 }
 
 /// A trainer before its first step.
-fn first_trainer(request: &TrainRequest, dataset: Arc<Dataset>, options: TrainOptions) -> Result<Trainer, RunError> {
+fn new_trainer(request: &TrainRequest, dataset: Arc<Dataset>, options: TrainOptions) -> Result<Trainer, RunError> {
     let mut recipe = request.recipe.clone();
-    Ok(match request.first_splats(&dataset)? {
+    Ok(match request.initial_splats(&dataset)? {
         Some((splats, antialiased)) => {
             recipe.render.antialias |= antialiased;
             Trainer::from_splats(dataset, recipe, options, splats)?
@@ -315,7 +332,7 @@ fn train_options(request: &TrainRequest) -> Result<TrainOptions, RunError> {
     Ok(TrainOptions {
         seed: input.seed,
         steps: input.steps,
-        memory: input.memory.or_else(usual_limit),
+        memory: input.memory.or_else(default_limit),
         lpips: input.lpips.as_ref().map(Lpips::load).transpose()?.map(Arc::new),
         device: open_device(&input.device)?,
     })

@@ -9,9 +9,9 @@ use irradia_train::memory;
 use std::thread::JoinHandle;
 
 /// Copying is worth its memory for checkpoints of at least this many bytes: smaller ones are written in half a second.
-const BACKGROUND_FROM: u64 = 256 << 20;
+const MIN_BACKGROUND_BYTES: u64 = 256 << 20;
 /// Number of splats for which memory is obtained, relative to the current number: density control adds some before the checkpoint.
-const ROOM: f64 = 1.25;
+const RESERVE_FACTOR: f64 = 1.25;
 
 /// Step and path of a checkpoint, or why it was not written.
 type Outcome = Result<(u64, String), String>;
@@ -22,22 +22,24 @@ pub(crate) struct Saver {
     writing: Option<JoinHandle<(Outcome, SplatState)>>,
     outcome: Option<Outcome>,
     /// The memory for the next copy, unless it is still being obtained.
-    spare: SplatState,
-    obtaining: Option<JoinHandle<SplatState>>,
+    buffer: SplatState,
+    allocating: Option<JoinHandle<SplatState>>,
 }
 
 impl Saver {
-    /// Obtains memory for a copy of `state`, which will have at most `most` splats, if checkpoints are to be written in the background
+    /// Obtains memory for a copy of `state`, which will have at most `max_splats` splats, if checkpoints are to be written in the background
     /// and there is none yet. Returns immediately.
-    pub fn prepare(&mut self, state: &SplatState, most: usize) {
-        let busy = self.writing.is_some() || self.obtaining.is_some();
-        if busy || self.spare.has_room_for(state) || !copies(state.bytes() as u64, self.spare.bytes()) {
+    pub fn prepare(&mut self, state: &SplatState, max_splats: usize) {
+        let busy = self.writing.is_some() || self.allocating.is_some();
+        if busy || self.buffer.has_room_for(state) || !should_copy(state.bytes() as u64, self.buffer.bytes()) {
             return;
         }
-        self.spare = SplatState::default();
-        let len = ((state.len() as f64 * ROOM) as usize).min(most).max(state.len());
+        self.buffer = SplatState::default();
+        let len = ((state.len() as f64 * RESERVE_FACTOR) as usize)
+            .min(max_splats)
+            .max(state.len());
         let degree = state.splats.sh_degree();
-        self.obtaining = Some(std::thread::spawn(move || SplatState::resident(len, degree)));
+        self.allocating = Some(std::thread::spawn(move || SplatState::resident(len, degree)));
     }
 
     /// Writes `checkpoint`. Returns its path, or `None` if it is still being written from a copy: this is the case if it is large and
@@ -47,14 +49,14 @@ impl Saver {
     /// One line.
     pub fn save(&mut self, folder: &RunFolder, checkpoint: Checkpoint) -> Result<Option<String>, String> {
         self.wait();
-        if let Some(obtaining) = self.obtaining.take() {
-            self.spare = obtaining.join().unwrap_or_default();
+        if let Some(allocating) = self.allocating.take() {
+            self.buffer = allocating.join().unwrap_or_default();
         }
-        if !copies(checkpoint.bytes(), self.spare.bytes()) {
-            self.spare = SplatState::default();
+        if !should_copy(checkpoint.bytes(), self.buffer.bytes()) {
+            self.buffer = SplatState::default();
             return self.save_now(folder, &checkpoint).map(Some);
         }
-        self.save_behind(folder, &checkpoint);
+        self.save_in_background(folder, &checkpoint);
         Ok(None)
     }
 
@@ -67,10 +69,10 @@ impl Saver {
         write(folder, checkpoint).map(|(_, path)| path)
     }
 
-    fn save_behind(&mut self, folder: &RunFolder, checkpoint: &Checkpoint) {
+    fn save_in_background(&mut self, folder: &RunFolder, checkpoint: &Checkpoint) {
         self.wait();
-        let spare = std::mem::take(&mut self.spare);
-        let (folder, copy) = (folder.clone(), checkpoint.copied_into(spare));
+        let buffer = std::mem::take(&mut self.buffer);
+        let (folder, copy) = (folder.clone(), checkpoint.copied_into(buffer));
         self.writing = Some(std::thread::spawn(move || (write(&folder, &copy), copy.into_state())));
     }
 
@@ -83,8 +85,8 @@ impl Saver {
                     SplatState::default(),
                 )
             };
-            let (outcome, spare) = writing.join().unwrap_or_else(failed);
-            (self.outcome, self.spare) = (Some(outcome), spare);
+            let (outcome, buffer) = writing.join().unwrap_or_else(failed);
+            (self.outcome, self.buffer) = (Some(outcome), buffer);
         }
     }
 
@@ -126,9 +128,9 @@ impl Drop for Saver {
 }
 
 /// Whether a state of `bytes` is copied, if `held` bytes have already been obtained for the copy.
-fn copies(bytes: u64, held: usize) -> bool {
+fn should_copy(bytes: u64, held: usize) -> bool {
     let enough = |free: usize| (free + held) as u64 >= 2 * bytes;
-    bytes >= BACKGROUND_FROM && memory::free().is_some_and(enough)
+    bytes >= MIN_BACKGROUND_BYTES && memory::free().is_some_and(enough)
 }
 
 fn write(folder: &RunFolder, checkpoint: &Checkpoint) -> Outcome {
@@ -147,15 +149,15 @@ mod tests {
     fn memory_is_obtained_for_large_states_alone_and_once() {
         let mut saver = Saver::default();
         saver.prepare(&SplatState::resident(1000, 3), 2000);
-        assert!(saver.obtaining.is_none(), "a small state is written at once");
+        assert!(saver.allocating.is_none(), "a small state is written at once");
         // 752 bytes a splat.
         let large = SplatState::resident(400_000, 3);
-        if copies(large.bytes() as u64, 0) {
+        if should_copy(large.bytes() as u64, 0) {
             saver.prepare(&large, 450_000);
-            saver.spare = saver.obtaining.take().expect("begun").join().unwrap();
-            assert_eq!(saver.spare.len(), 450_000);
+            saver.buffer = saver.allocating.take().expect("begun").join().unwrap();
+            assert_eq!(saver.buffer.len(), 450_000);
             saver.prepare(&large, 450_000);
-            assert!(saver.obtaining.is_none(), "there is enough");
+            assert!(saver.allocating.is_none(), "there is enough");
         }
     }
 
@@ -179,7 +181,7 @@ mod tests {
         run.train(&mut []).unwrap();
         let mut saver = Saver::default();
         let checkpoint = Checkpoint::of(&run.trainer);
-        saver.save_behind(&run.folder, &checkpoint);
+        saver.save_in_background(&run.folder, &checkpoint);
         saver.wait();
         let (step, path) = saver.take_saved().expect("written");
         assert!(step == 2 && run.folder.file(&path).is_file());
@@ -187,7 +189,7 @@ mod tests {
 
         std::fs::remove_dir_all(run.folder.file("checkpoints")).unwrap();
         std::fs::write(run.folder.file("checkpoints"), "").unwrap();
-        saver.save_behind(&run.folder, &checkpoint);
+        saver.save_in_background(&run.folder, &checkpoint);
         saver.wait();
         assert_eq!(saver.take_saved(), None);
         assert!(saver.take_failure().is_some_and(|why| why.starts_with("no checkpoint")));

@@ -1,7 +1,7 @@
 //! A scene that can be rendered: read from a file or a run, or taken from a training.
 
 use crate::folder::{APPEARANCE, EXPOSURES, FIELD, RESIDUAL, SCENE, SKY, VIGNETTE, cameras_beside, world_beside};
-use crate::orbit::{Outlook, orbit, outlook};
+use crate::orbit::{OrbitGeometry, orbit, orbit_geometry};
 use crate::{RunError, RunFolder};
 use irradia_edit::Draft;
 use irradia_field::{Field, Sampler};
@@ -59,7 +59,7 @@ impl Scene {
     /// # Errors
     /// When it cannot be read, or is a residual field without its splats.
     pub fn read(path: impl AsRef<Path>) -> Result<Self, RunError> {
-        let path = &scene_of(path.as_ref());
+        let path = &scene_path(path.as_ref());
         let (model, antialiased, world_from_dataset, notes) = read_model(path)?;
         let knobs = render_knobs_beside(path);
         Ok(Self {
@@ -78,7 +78,7 @@ impl Scene {
     /// The visible part of a scene that is being edited.
     pub fn of_draft(draft: &Draft, options: RenderOptions) -> Self {
         Self {
-            model: Model::of_splats(Splats::from_cloud(&draft.shown())),
+            model: Model::of_splats(Splats::from_cloud(&draft.visible_cloud())),
             options,
             cameras: (!draft.cameras.is_empty()).then(|| draft.cameras.clone().into()),
             world_from_dataset: draft.cloud.world_from_dataset,
@@ -104,13 +104,13 @@ impl Scene {
     }
 
     /// Where the scene is viewed from: its centre, up axis and extent.
-    pub fn outlook(&self) -> Outlook {
-        outlook(self.model.splats(), self.cameras.as_deref())
+    pub fn orbit_geometry(&self) -> OrbitGeometry {
+        orbit_geometry(self.model.splats(), self.cameras.as_deref())
     }
 }
 
 /// The scene's file if `path` is a run's folder or a folder of SOG images, otherwise `path` itself.
-pub fn scene_of(path: &Path) -> PathBuf {
+pub fn scene_path(path: &Path) -> PathBuf {
     let files = [SCENE, FIELD].map(|name| path.join(name));
     let meta = is_sog_folder(path).then(|| path.join(SplatFormat::SogFolder.suffix()));
     let found = files.into_iter().find(|file| file.is_file());
@@ -121,8 +121,8 @@ pub fn scene_of(path: &Path) -> PathBuf {
 ///
 /// # Errors
 /// When `output` is `scene`, or the scene's file in that folder.
-pub fn check_kept(scene: &Path, output: &Path) -> Result<(), RunError> {
-    let scene = scene_of(scene);
+pub fn check_not_overwritten(scene: &Path, output: &Path) -> Result<(), RunError> {
+    let scene = scene_path(scene);
     // A folder of SOG images is written as its list.
     let list = output.join(SplatFormat::SogFolder.suffix());
     match same_file(output, &scene) || same_file(&list, &scene) {
@@ -175,7 +175,7 @@ fn read_model(path: &Path) -> Result<(Model<'static>, bool, Similarity, Vec<Stri
 }
 
 /// The file `name` in the folder of a run, for any scene in it: what lenses do, and what is behind the scene, survive edits.
-fn of_run(scene: &Path, name: &str) -> Option<PathBuf> {
+fn run_file(scene: &Path, name: &str) -> Option<PathBuf> {
     let path = scene.with_file_name(name);
     (RunFolder::containing(scene).is_some() || scene.file_name().is_some_and(|name| name == SCENE))
         .then_some(path)
@@ -183,24 +183,26 @@ fn of_run(scene: &Path, name: &str) -> Option<PathBuf> {
 }
 
 /// The file `name` beside the scene of a run, if there is one.
-fn beside(scene: &Path, name: &str) -> Option<PathBuf> {
+fn file_beside(scene: &Path, name: &str) -> Option<PathBuf> {
     let path = scene.with_file_name(name);
     (scene.file_name().is_some_and(|name| name == SCENE) && path.is_file()).then_some(path)
 }
 
 /// The bytes of a file, if there is one.
-fn bytes_of(file: Option<PathBuf>) -> Result<Option<Vec<u8>>, RunError> {
+fn read_optional(file: Option<PathBuf>) -> Result<Option<Vec<u8>>, RunError> {
     let read = |path: PathBuf| fs::read(&path).map_err(RunError::io("read", &path));
     file.map(read).transpose()
 }
 
 /// The file `name` in the folder of a run, if there is one, parsed by `parse`.
-fn parsed_of_run<T>(
+fn parse_run_file<T>(
     scene: &Path,
     name: &str,
     parse: impl FnOnce(&[u8]) -> Result<T, String>,
 ) -> Result<Option<T>, RunError> {
-    let parsed = bytes_of(of_run(scene, name))?.map(|bytes| parse(&bytes)).transpose();
+    let parsed = read_optional(run_file(scene, name))?
+        .map(|bytes| parse(&bytes))
+        .transpose();
     parsed.map_err(|why| RunError::File {
         path: scene.with_file_name(name),
         source: TrainError::Checkpoint(why),
@@ -209,12 +211,12 @@ fn parsed_of_run<T>(
 
 /// The residual field beside `scene`, if there is one.
 pub(crate) fn residual_beside(scene: &Path) -> Result<Option<Field>, RunError> {
-    beside(scene, RESIDUAL).as_deref().map(read_field).transpose()
+    file_beside(scene, RESIDUAL).as_deref().map(read_field).transpose()
 }
 
 /// A note if the scene `scene` has a residual field, which is left out for the reason `why`.
 pub fn residual_left_out(scene: &Path, why: &str) -> Option<String> {
-    beside(scene, RESIDUAL).map(|_| format!("{RESIDUAL} is left out: {why}"))
+    file_beside(scene, RESIDUAL).map(|_| format!("{RESIDUAL} is left out: {why}"))
 }
 
 /// The light of each photograph of the run whose scene is the file `scene`, if the run has learned it. The scene itself is shown in
@@ -224,8 +226,8 @@ pub fn residual_left_out(scene: &Path, why: &str) -> Option<String> {
 /// When one of their files cannot be read, or the files do not belong together.
 pub fn read_lights(scene: &Path) -> Result<Option<Lights>, RunError> {
     let [exposures, appearance] = [
-        bytes_of(beside(scene, EXPOSURES))?,
-        bytes_of(beside(scene, APPEARANCE))?,
+        read_optional(file_beside(scene, EXPOSURES))?,
+        read_optional(file_beside(scene, APPEARANCE))?,
     ];
     Lights::from_files(exposures.as_deref(), appearance.as_deref()).map_err(|source| RunError::File {
         path: scene.to_owned(),
@@ -238,12 +240,12 @@ pub fn read_lights(scene: &Path) -> Result<Option<Lights>, RunError> {
 /// # Errors
 /// When its file cannot be read.
 pub fn read_vignette(scene: &Path) -> Result<Option<Vignette>, RunError> {
-    parsed_of_run(scene, VIGNETTE, Vignette::from_file)
+    parse_run_file(scene, VIGNETTE, Vignette::from_file)
 }
 
 /// The mean colour of the sky beside `scene`, if there is one.
 fn sky_beside(scene: &Path) -> Result<Option<[f32; 3]>, RunError> {
-    parsed_of_run(scene, SKY, background_of_sky)
+    parse_run_file(scene, SKY, background_of_sky)
 }
 
 /// Background and antialiasing of the run that contains `scene`; the defaults if there is no run.

@@ -42,7 +42,7 @@ struct State {
 #[derive(Default)]
 struct Shared {
     /// Whether a request is pending; read between steps without a lock.
-    wanted: AtomicBool,
+    requested: AtomicBool,
     state: Mutex<State>,
     answered: Condvar,
 }
@@ -68,7 +68,7 @@ impl Snapshots {
         let mut state = self.0.lock();
         let before = state.answers;
         if state.running {
-            self.0.wanted.store(true, Ordering::Relaxed);
+            self.0.requested.store(true, Ordering::Relaxed);
         }
         while state.running && state.answers == before {
             state = self.0.answered.wait(state).unwrap_or_else(PoisonError::into_inner);
@@ -78,7 +78,7 @@ impl Snapshots {
 
     /// Requests the latest state without waiting: [`Snapshots::last`] returns it after the current step.
     pub fn request(&self) {
-        self.0.wanted.store(true, Ordering::Relaxed);
+        self.0.requested.store(true, Ordering::Relaxed);
     }
 
     /// The state most recently requested by any handle.
@@ -91,14 +91,14 @@ impl Snapshots {
 pub(crate) struct SnapshotServer {
     shared: Arc<Shared>,
     /// Shared by all snapshots, created at the first request.
-    common: Option<(Arc<Recipe>, Arc<[Camera]>)>,
+    shared_parts: Option<(Arc<Recipe>, Arc<[Camera]>)>,
 }
 
 impl SnapshotServer {
     pub fn new() -> Self {
         Self {
             shared: Arc::default(),
-            common: None,
+            shared_parts: None,
         }
     }
 
@@ -125,19 +125,19 @@ impl SnapshotServer {
     }
 
     fn answer(&mut self, trainer: &Trainer) {
-        if self.shared.wanted.load(Ordering::Relaxed) {
+        if self.shared.requested.load(Ordering::Relaxed) {
             self.publish(trainer);
         }
     }
 
     fn publish(&mut self, trainer: &Trainer) {
-        let (recipe, cameras) = self.common.get_or_insert_with(|| {
+        let (recipe, cameras) = self.shared_parts.get_or_insert_with(|| {
             let dataset = &trainer.dataset;
             let cameras = dataset.train.iter().map(|i| dataset.views[*i].camera).collect();
             (Arc::new(trainer.recipe.clone()), cameras)
         });
         let mut state = self.shared.lock();
-        self.shared.wanted.store(false, Ordering::Relaxed);
+        self.shared.requested.store(false, Ordering::Relaxed);
         let step = trainer.clock.step;
         if state.newest.as_ref().is_none_or(|newest| newest.step != step) {
             state.newest = Some(Arc::new(Snapshot {

@@ -24,7 +24,7 @@ const DEPTH_SCALE: f32 = 0.0005;
 /// The same for outdoor scenes: 16 bits reach 655 units.
 const DEPTH_SCALE_OUTDOOR: f32 = 0.01;
 /// Readout time of photographs by moving cameras, seconds; only its product with the velocities matters.
-const READOUT: f32 = 0.02;
+const READOUT_SECONDS: f32 = 0.02;
 
 /// Summary of the dataset.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -87,7 +87,7 @@ pub fn write_synth_dataset(out: impl AsRef<Path>, options: &SynthOptions) -> Res
             "transform_matrix": blender_matrix(&shot.camera),
         });
         if let Some(shutter) = &shot.camera.shutter {
-            let velocity = |way: Vec3| (way * Vec3::new(1.0, -1.0, -1.0) / READOUT).to_array();
+            let velocity = |way: Vec3| (way * Vec3::new(1.0, -1.0, -1.0) / READOUT_SECONDS).to_array();
             entry["camera_linear_velocity"] = json!(velocity(shutter.translation));
             entry["camera_angular_velocity"] = json!(velocity(shutter.rotation));
         }
@@ -105,7 +105,7 @@ pub fn write_synth_dataset(out: impl AsRef<Path>, options: &SynthOptions) -> Res
             "frames": frames,
         });
         if options.turn > 0.0 {
-            transforms["rolling_shutter_time"] = json!(READOUT);
+            transforms["rolling_shutter_time"] = json!(READOUT_SECONDS);
         }
         match k.lens {
             Lens::Fisheye { .. } => {

@@ -3,28 +3,28 @@
 //!
 //! Only for photographs from a camera that is known to be at rest: white paper looks the same to a moving camera.
 
-use crate::connected;
-use crate::still_scene::{adjacent, channel, means, samples, variance};
+use crate::connected_components;
+use crate::still_scene::{adjacent, channel, patch_means, patch_variance, samples};
 use rayon::prelude::*;
 
 /// Maximum difference of a channel's mean around a pixel, of 255, for the same backdrop in other light: the white balance of a phone,
 /// shadows of what turns.
-const SHADE: f32 = 30.0;
+const MAX_SHADE_DIFFERENCE: f32 = 30.0;
 /// Maximum standard deviation of a channel around a pixel in a plain area, of 255.
-const PLAIN: f32 = 3.0;
+const MAX_PLAIN_DEVIATION: f32 = 3.0;
 /// Number of rounds in which the light of a photograph is estimated.
-const ROUNDS: usize = 3;
+const GAIN_ITERATIONS: usize = 3;
 /// Half the minimum width of a passage from the border, px: what turns merges with the backdrop in single pixels.
-const PASSAGE: usize = 3;
+const MIN_PASSAGE_HALF_WIDTH: usize = 3;
 /// Half the minimum width, px, of what looks the same in most photographs and turns nevertheless, such as a vase: anything thinner is
 /// a line in the background, such as the rim of the plate.
-const THIN: usize = 7;
+const MIN_OBJECT_HALF_WIDTH: usize = 7;
 /// Maximum variance of the difference from the backdrop, relative to that of the photograph, at an edge in the background: a camera at
 /// rest moves by a fraction of a pixel.
-const ALIKE: f32 = 0.25;
+const MAX_VARIANCE_RATIO: f32 = 0.25;
 /// A region in front of the backdrop that is this many times smaller than the largest one is part of the backdrop, such as the edge of
 /// the paper.
-const SPECK: usize = 20;
+const MAX_SIZE_RATIO: usize = 20;
 
 /// What most photographs from a camera show at each pixel.
 pub struct Backdrop {
@@ -38,7 +38,7 @@ impl Backdrop {
     ///
     /// # Panics
     /// When there is no picture, or one does not have `width * height` pixels.
-    pub fn of(width: usize, height: usize, pictures: &[impl AsRef<[u8]>]) -> Self {
+    pub fn from_pictures(width: usize, height: usize, pictures: &[impl AsRef<[u8]>]) -> Self {
         let samples = samples(width, height, pictures);
         let median = |at: usize| {
             let mut values: Vec<u8> = samples.iter().map(|sample| sample[at]).collect();
@@ -55,54 +55,71 @@ impl Backdrop {
     ///
     /// # Panics
     /// When the picture has another size.
-    pub fn shown(&self, picture: &[u8]) -> Vec<bool> {
+    pub fn mask(&self, picture: &[u8]) -> Vec<bool> {
         assert_eq!(picture.len(), 3 * self.color[0].len());
         let color = [0, 1, 2].map(|c| channel(picture, c));
-        let light = self.light(&color);
+        let gains = self.channel_gains(&color);
         let difference = [0, 1, 2].map(|c| -> Vec<f32> {
             let both = color[c].iter().zip(&self.color[c]);
-            both.map(|(here, behind)| here - light[c] * behind).collect()
+            both.map(|(here, behind)| here - gains[c] * behind).collect()
         });
-        let shade = difference.each_ref().map(|d| means(self.width, d));
-        let (varies, texture) = (variance(self.width, &difference), variance(self.width, &color));
-        let plain = 3.0 * PLAIN * PLAIN;
-        let is_alike = |i: usize, most: f32| shade.iter().all(|s| s[i].abs() < SHADE) && varies[i] < most;
-        let is_shown = |i: usize| is_alike(i, plain) && texture[i] < plain;
-        let mut shown: Vec<bool> = (0..texture.len()).map(is_shown).collect();
-        shown = self.spread(shown, PASSAGE, false);
-        for region in self.regions(&shown) {
-            let is_joined = region.iter().any(|at| self.is_border(*at));
-            region.into_iter().for_each(|at| shown[at] &= is_joined);
+        let shade = difference.each_ref().map(|d| patch_means(self.width, d));
+        let (difference_variance, texture) = (
+            patch_variance(self.width, &difference),
+            patch_variance(self.width, &color),
+        );
+        let max_plain_variance = 3.0 * MAX_PLAIN_DEVIATION * MAX_PLAIN_DEVIATION;
+        let is_similar = |i: usize, max_variance: f32| {
+            shade.iter().all(|s| s[i].abs() < MAX_SHADE_DIFFERENCE) && difference_variance[i] < max_variance
+        };
+        let is_backdrop = |i: usize| is_similar(i, max_plain_variance) && texture[i] < max_plain_variance;
+        let mut mask: Vec<bool> = (0..texture.len()).map(is_backdrop).collect();
+        mask = self.dilate_or_erode(mask, MIN_PASSAGE_HALF_WIDTH, false);
+        for region in self.regions(&mask) {
+            let reaches_border = region.iter().any(|at| self.is_border(*at));
+            region.into_iter().for_each(|at| mask[at] &= reaches_border);
         }
-        shown = self.spread(shown, PASSAGE, true);
-        let hides = shown.iter().map(|shown| !shown).collect();
-        let thick = self.spread(self.spread(hides, THIN, false), THIN, true);
-        let is_line = |at: usize| is_alike(at, plain.max(ALIKE * texture[at])) && !thick[at] && !shown[at];
-        let lines: Vec<bool> = (0..shown.len()).map(is_line).collect();
+        mask = self.dilate_or_erode(mask, MIN_PASSAGE_HALF_WIDTH, true);
+        let foreground = mask.iter().map(|covered| !covered).collect();
+        let thick_foreground = self.dilate_or_erode(
+            self.dilate_or_erode(foreground, MIN_OBJECT_HALF_WIDTH, false),
+            MIN_OBJECT_HALF_WIDTH,
+            true,
+        );
+        let is_line = |at: usize| {
+            is_similar(at, max_plain_variance.max(MAX_VARIANCE_RATIO * texture[at]))
+                && !thick_foreground[at]
+                && !mask[at]
+        };
+        let lines: Vec<bool> = (0..mask.len()).map(is_line).collect();
         // A line that reaches the border is in the background: a stem that looks the same from all sides ends inside the photograph.
         for line in self.regions(&lines) {
-            let leads_out = lines[line[0]] && line.iter().any(|at| self.is_border(*at));
-            line.into_iter().for_each(|at| shown[at] |= leads_out);
+            let reaches_border = lines[line[0]] && line.iter().any(|at| self.is_border(*at));
+            line.into_iter().for_each(|at| mask[at] |= reaches_border);
         }
-        let mut hidden = self.regions(&shown);
-        hidden.retain(|region| !shown[region[0]]);
-        let largest = hidden.first().map_or(0, Vec::len);
-        for speck in hidden.into_iter().filter(|region| region.len() < largest / SPECK) {
-            speck.into_iter().for_each(|at| shown[at] = true);
+        let mut foreground_regions = self.regions(&mask);
+        foreground_regions.retain(|region| !mask[region[0]]);
+        let largest = foreground_regions.first().map_or(0, Vec::len);
+        for speck in foreground_regions
+            .into_iter()
+            .filter(|region| region.len() < largest / MAX_SIZE_RATIO)
+        {
+            speck.into_iter().for_each(|at| mask[at] = true);
         }
-        shown
+        mask
     }
 
-    /// The fraction of a photograph's border where the backdrop is `shown`.
-    pub fn surrounds(&self, shown: &[bool]) -> f64 {
-        let border = || (0..shown.len()).filter(|at| self.is_border(*at));
-        border().filter(|at| shown[*at]).count() as f64 / border().count().max(1) as f64
+    /// The fraction of a photograph's border where `mask` shows the backdrop.
+    pub fn border_fraction(&self, mask: &[bool]) -> f64 {
+        let border = || (0..mask.len()).filter(|at| self.is_border(*at));
+        border().filter(|at| mask[*at]).count() as f64 / border().count().max(1) as f64
     }
 
-    /// Range of the backdrop's colour where it is `shown`, of 255, without the lowest and highest twentieth: the maximum over the channels.
-    pub fn range(&self, shown: &[bool]) -> f32 {
+    /// Range of the backdrop's colour where `mask` shows it, of 255, without the lowest and highest twentieth: the maximum over the
+    /// channels.
+    pub fn color_range(&self, mask: &[bool]) -> f32 {
         let range = |color: &Vec<f32>| {
-            let mut values: Vec<f32> = color.iter().zip(shown).filter(|v| *v.1).map(|v| *v.0).collect();
+            let mut values: Vec<f32> = color.iter().zip(mask).filter(|v| *v.1).map(|v| *v.0).collect();
             values.sort_by(f32::total_cmp);
             match values.len() {
                 0 => 0.0,
@@ -113,17 +130,17 @@ impl Backdrop {
     }
 
     /// Brightness of each channel of a photograph relative to the backdrop.
-    fn light(&self, color: &[Vec<f32>; 3]) -> [f32; 3] {
-        let mut light = [0, 1, 2].map(|c| {
+    fn channel_gains(&self, color: &[Vec<f32>; 3]) -> [f32; 3] {
+        let mut gains = [0, 1, 2].map(|c| {
             let both = color[c].iter().zip(&self.color[c]);
             let mut ratios: Vec<f32> = both.map(|(here, behind)| here / behind.max(1.0)).collect();
             let middle = ratios.len() / 2;
             *ratios.select_nth_unstable_by(middle, f32::total_cmp).1
         });
-        for _ in 0..ROUNDS {
+        for _ in 0..GAIN_ITERATIONS {
             let (mut here, mut behind) = ([0.0f64; 3], [0.0f64; 3]);
             for i in 0..color[0].len() {
-                if (0..3).all(|c| (color[c][i] - light[c] * self.color[c][i]).abs() < SHADE) {
+                if (0..3).all(|c| (color[c][i] - gains[c] * self.color[c][i]).abs() < MAX_SHADE_DIFFERENCE) {
                     for c in 0..3 {
                         here[c] += f64::from(color[c][i]);
                         behind[c] += f64::from(self.color[c][i]);
@@ -131,29 +148,29 @@ impl Backdrop {
                 }
             }
             if behind.iter().all(|sum| *sum > 0.0) {
-                light = [0, 1, 2].map(|c| (here[c] / behind[c]) as f32);
+                gains = [0, 1, 2].map(|c| (here[c] / behind[c]) as f32);
             }
         }
-        light
+        gains
     }
 
-    /// Dilates `shown` by `pixels` if it `grows`, else erodes it by `pixels`.
-    fn spread(&self, mut shown: Vec<bool>, pixels: usize, grows: bool) -> Vec<bool> {
+    /// Dilates `mask` by `pixels` if `dilates`, else erodes it by `pixels`.
+    fn dilate_or_erode(&self, mut mask: Vec<bool>, pixels: usize, dilates: bool) -> Vec<bool> {
         for _ in 0..pixels {
-            let beside = |at: usize| adjacent(self.width, shown.len(), at);
-            let all = 0..shown.len();
-            shown = match grows {
-                true => all.map(|at| shown[at] || beside(at).any(|to| shown[to])).collect(),
-                false => all.map(|at| shown[at] && beside(at).all(|to| shown[to])).collect(),
+            let neighbours = |at: usize| adjacent(self.width, mask.len(), at);
+            let all = 0..mask.len();
+            mask = match dilates {
+                true => all.map(|at| mask[at] || neighbours(at).any(|to| mask[to])).collect(),
+                false => all.map(|at| mask[at] && neighbours(at).all(|to| mask[to])).collect(),
             };
         }
-        shown
+        mask
     }
 
-    /// Connected regions of pixels that are all `shown` or all not `shown`, largest first.
-    fn regions(&self, shown: &[bool]) -> Vec<Vec<usize>> {
-        let alike = |at: usize| adjacent(self.width, shown.len(), at).filter(move |to| shown[*to] == shown[at]);
-        connected(shown.len(), alike)
+    /// Connected regions of pixels that are all true or all false in `mask`, largest first.
+    fn regions(&self, mask: &[bool]) -> Vec<Vec<usize>> {
+        let with_same_value = |at: usize| adjacent(self.width, mask.len(), at).filter(move |to| mask[*to] == mask[at]);
+        connected_components(mask.len(), with_same_value)
     }
 
     fn is_border(&self, at: usize) -> bool {
@@ -189,13 +206,13 @@ mod tests {
     #[test]
     fn paper_is_shown_and_what_it_surrounds_is_not() {
         let pictures: Vec<Vec<u8>> = (0..8).map(|i| picture(8 + 4 * i, 1.0 - 0.02 * i as f32)).collect();
-        let backdrop = Backdrop::of(SIZE[0], SIZE[1], &pictures);
-        let shown = backdrop.shown(&pictures[5]);
+        let backdrop = Backdrop::from_pictures(SIZE[0], SIZE[1], &pictures);
+        let shown = backdrop.mask(&pictures[5]);
         let at = |x: usize, y: usize| shown[y * SIZE[0] + x];
         assert!(at(2, 2) && at(10, 24) && at(60, 24) && at(38, 44));
         assert!(!at(30, 24) && !at(38, 24) && !at(46, 30));
-        assert!(backdrop.surrounds(&shown) > 0.99);
-        let range = backdrop.range(&shown);
+        assert!(backdrop.border_fraction(&shown) > 0.99);
+        let range = backdrop.color_range(&shown);
         assert!((40.0..64.0).contains(&range), "{range}");
     }
 
@@ -208,7 +225,7 @@ mod tests {
             picture
         };
         let pictures: Vec<Vec<u8>> = (0..6).map(|i| with_line(picture(16 + 4 * i, 1.0))).collect();
-        let shown = Backdrop::of(SIZE[0], SIZE[1], &pictures).shown(&pictures[5]);
+        let shown = Backdrop::from_pictures(SIZE[0], SIZE[1], &pictures).mask(&pictures[5]);
         let at = |x: usize, y: usize| shown[y * SIZE[0] + x];
         assert!(at(2, 24) && at(8, 24) && at(9, 40) && at(14, 24));
         // Five of six photographs show the box there.
@@ -229,9 +246,9 @@ mod tests {
                 (0..3 * SIZE[0] * SIZE[1]).map(value).collect()
             })
             .collect();
-        let backdrop = Backdrop::of(SIZE[0], SIZE[1], &pictures);
-        let shown = backdrop.shown(&pictures[0]);
-        assert_eq!(backdrop.surrounds(&shown), 0.0);
-        assert_eq!(backdrop.range(&shown), 0.0);
+        let backdrop = Backdrop::from_pictures(SIZE[0], SIZE[1], &pictures);
+        let shown = backdrop.mask(&pictures[0]);
+        assert_eq!(backdrop.border_fraction(&shown), 0.0);
+        assert_eq!(backdrop.color_range(&shown), 0.0);
     }
 }

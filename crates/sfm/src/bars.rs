@@ -3,20 +3,20 @@
 use crate::median;
 
 /// Maximum difference of a bar's pixel from the bar's colour in each channel, of 255.
-const TOLERANCE: f64 = 12.0;
+const MAX_COLOR_DIFFERENCE: f64 = 12.0;
 /// Minimum fraction of a line's pixels that have the bar's colour, in every photograph.
-const PLAIN: f64 = 0.99;
+const MIN_BAR_FRACTION: f64 = 0.99;
 /// Maximum such fraction of the line behind the bar's edge, in at least half of the photographs: dark or empty parts of the scene
 /// end elsewhere in each photograph.
-const BEHIND: f64 = 0.5;
+const MAX_INNER_FRACTION: f64 = 0.5;
 /// Lines over which the edge of a bar is blurred, by scaling and by compression.
-const BLURRED: usize = 3;
+const BLURRED_LINES: usize = 3;
 /// Minimum width of a bar, relative to the longer side.
-const LEAST: f64 = 0.006;
+const MIN_BAR_WIDTH: f64 = 0.006;
 
 /// Widths of the left, top, right and bottom bars of `pictures`, `[H, W, 3]`, px; 0 where there is no bar.
 pub fn bars(width: usize, height: usize, pictures: &[&Vec<u8>]) -> [usize; 4] {
-    let least = (LEAST * width.max(height) as f64).ceil() as usize;
+    let min_width = (MIN_BAR_WIDTH * width.max(height) as f64).ceil() as usize;
     [0, 1, 2, 3].map(|side| {
         let is_column = side % 2 == 0;
         let (lines, length) = if is_column { (width, height) } else { (height, width) };
@@ -41,16 +41,21 @@ pub fn bars(width: usize, height: usize, pictures: &[&Vec<u8>]) -> [usize; 4] {
             .unwrap_or(0.0)
         };
         let colour = [0, 1, 2].map(outermost);
-        let share = |picture: &[u8], line: usize| {
-            let near = |at: &usize| (0..3).all(|c| (pixel(picture, line, *at)[c] - colour[c]).abs() <= TOLERANCE);
+        let bar_fraction = |picture: &[u8], line: usize| {
+            let near =
+                |at: &usize| (0..3).all(|c| (pixel(picture, line, *at)[c] - colour[c]).abs() <= MAX_COLOR_DIFFERENCE);
             (0..length).filter(near).count() as f64 / length as f64
         };
-        let is_plain = |line: &usize| pictures.iter().all(|picture| share(picture, *line) >= PLAIN);
-        let depth = (0..lines / 2).take_while(is_plain).count();
-        let behind = depth + BLURRED;
-        let differs = |picture: &&&Vec<u8>| share(picture, behind) <= BEHIND;
-        let has_edge = behind < lines && 2 * pictures.iter().filter(differs).count() >= pictures.len();
-        if depth >= least && has_edge { depth } else { 0 }
+        let is_bar = |line: &usize| {
+            pictures
+                .iter()
+                .all(|picture| bar_fraction(picture, *line) >= MIN_BAR_FRACTION)
+        };
+        let depth = (0..lines / 2).take_while(is_bar).count();
+        let inner = depth + BLURRED_LINES;
+        let differs = |picture: &&&Vec<u8>| bar_fraction(picture, inner) <= MAX_INNER_FRACTION;
+        let has_edge = inner < lines && 2 * pictures.iter().filter(differs).count() >= pictures.len();
+        if depth >= min_width && has_edge { depth } else { 0 }
     })
 }
 

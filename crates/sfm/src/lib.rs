@@ -22,8 +22,8 @@ pub mod upright;
 
 pub use backdrop::Backdrop;
 pub use bars::bars;
-pub(crate) use connected::connected;
+pub(crate) use connected::connected_components;
 pub use keypoints::{DESCRIPTOR_BYTES, Features, Keypoint, PairMatches};
 pub(crate) use median::median;
-pub use overlay::Overlay;
-pub use still_scene::{Shown, StillScene};
+pub use overlay::OverlayDetector;
+pub use still_scene::{Segmentation, StillScene};

@@ -9,29 +9,29 @@ use crate::median;
 use rayon::prelude::*;
 
 /// Maximum number of photographs from which the background's colours are estimated.
-const SAMPLES: usize = 32;
+const MAX_SAMPLED_PHOTOS: usize = 32;
 /// Maximum difference of a channel between photographs that show the same at a pixel, of 255: noise, and slightly different light.
-const SAME: u8 = 15;
+const MAX_COLOR_DIFFERENCE: u8 = 15;
 /// Minimum fraction of the photographs that show the background's colour.
-const SUPPORT: f32 = 0.25;
+const MIN_SUPPORT: f32 = 0.25;
 /// Number of pixels on each side of a patch's centre.
-const REACH: usize = 2;
+const PATCH_RADIUS: usize = 2;
 /// Minimum standard deviation of a channel for a patch to have texture, and minimum difference for it to certainly differ, of 255.
-const TEXTURE: f32 = 5.0;
-const DIFFERS: f32 = 7.5;
+const MIN_TEXTURE_DEVIATION: f32 = 5.0;
+const MIN_MOVING_DIFFERENCE: f32 = 7.5;
 /// Variance of the difference relative to that of the patch, up to which the patch stands still, and above which it moves.
-const STILL: f32 = 0.15;
-const MOVES: f32 = 0.5;
+const MAX_STILL_VARIANCE_RATIO: f32 = 0.15;
+const MIN_MOVING_VARIANCE_RATIO: f32 = 0.5;
 /// Maximum difference of a channel's mean, of 255, for what stands still in other light.
-const SHADE: f32 = 20.0;
+const MAX_SHADE_DIFFERENCE: f32 = 20.0;
 /// A patch without texture is quiet if its difference, also between photographs, is up to this many times the median difference of
 /// patches that stand still, which makes it noise, and if it has this support. A region of such patches stands still if more than this
 /// fraction of the pixels around it do: a wall between twigs, but not a white floor on which everything moves.
-const QUIET: f64 = 3.0;
-const QUIET_SUPPORT: f32 = 0.6;
-const BESIDE: f64 = 0.1;
+const MAX_NOISE_RATIO: f64 = 3.0;
+const MIN_QUIET_SUPPORT: f32 = 0.6;
+const MIN_STILL_BORDER_FRACTION: f64 = 0.1;
 /// A region of less than this fraction of the pixels is noise.
-const SPECK: f64 = 0.0008;
+const MIN_REGION_FRACTION: f64 = 0.0008;
 
 /// The state of a patch.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -41,7 +41,7 @@ enum Label {
     /// Without texture, and its difference is noise.
     Quiet,
     /// Undecided.
-    Open,
+    Undecided,
 }
 
 /// What is the same in most photographs from a camera.
@@ -62,20 +62,21 @@ impl StillScene {
     ///
     /// # Panics
     /// When there is no picture, or one does not have `width * height` pixels.
-    pub fn of(width: usize, height: usize, pictures: &[impl AsRef<[u8]>]) -> Self {
+    pub fn from_pictures(width: usize, height: usize, pictures: &[impl AsRef<[u8]>]) -> Self {
         let samples = samples(width, height, pictures);
         let at = |pixel: usize| {
             let colors: Vec<[u8; 3]> = (samples.iter().map(|s| [0, 1, 2].map(|c| s[3 * pixel + c]))).collect();
-            Mode::of(&colors)
+            Mode::from_colors(&colors)
         };
         let modes: Vec<Mode> = (0..width * height).into_par_iter().map(at).collect();
         let color = [0, 1, 2].map(|c| modes.iter().map(|mode| mode.color[c]).collect());
-        let texture = variance(width, &color);
-        let spread = means(width, &modes.iter().map(|mode| mode.variance).collect::<Vec<_>>());
-        let often = |i: &usize| modes[*i].support >= QUIET_SUPPORT;
-        let textured = (0..modes.len()).filter(|i| often(i) && texture[*i] > 3.0 * TEXTURE * TEXTURE);
-        let noise = median(textured.map(|i| f64::from(spread[i])).collect()).unwrap_or(0.0);
-        let constant = (0..modes.len()).map(|i| often(&i) && f64::from(spread[i]) < QUIET * noise);
+        let texture = patch_variance(width, &color);
+        let variance = patch_means(width, &modes.iter().map(|mode| mode.variance).collect::<Vec<_>>());
+        let has_support = |i: &usize| modes[*i].support >= MIN_QUIET_SUPPORT;
+        let textured = (0..modes.len())
+            .filter(|i| has_support(i) && texture[*i] > 3.0 * MIN_TEXTURE_DEVIATION * MIN_TEXTURE_DEVIATION);
+        let noise = median(textured.map(|i| f64::from(variance[i])).collect()).unwrap_or(0.0);
+        let constant = (0..modes.len()).map(|i| has_support(&i) && f64::from(variance[i]) < MAX_NOISE_RATIO * noise);
         Self {
             width,
             constant: constant.collect(),
@@ -89,46 +90,48 @@ impl StillScene {
     ///
     /// # Panics
     /// When the picture has another size.
-    pub fn shown(&self, picture: &[u8]) -> Shown {
+    pub fn segment(&self, picture: &[u8]) -> Segmentation {
         assert_eq!(picture.len(), 3 * self.texture.len());
         let color = [0, 1, 2].map(|c| channel(picture, c));
-        let texture = variance(self.width, &color);
-        let labels = self.labels_in([1.0; 3], &color, &texture);
-        Shown {
+        let texture = patch_variance(self.width, &color);
+        let labels = self.label_patches([1.0; 3], &color, &texture);
+        Segmentation {
             width: self.width,
-            labels: self.labels_in(self.light(&color, &labels), &color, &texture),
+            labels: self.label_patches(self.channel_gains(&color, &labels), &color, &texture),
         }
     }
 
-    /// `[H, W]` the label of each patch of a photograph in which this scene is `light` times as bright.
-    fn labels_in(&self, light: [f32; 3], color: &[Vec<f32>; 3], texture: &[f32]) -> Vec<Label> {
+    /// `[H, W]` the label of each patch of a photograph in which this scene is `gains` times as bright.
+    fn label_patches(&self, gains: [f32; 3], color: &[Vec<f32>; 3], texture: &[f32]) -> Vec<Label> {
         let difference = [0, 1, 2].map(|c| -> Vec<f32> {
             let both = color[c].iter().zip(&self.color[c]);
-            both.map(|(a, b)| a - light[c] * b).collect()
+            both.map(|(a, b)| a - gains[c] * b).collect()
         });
-        let shade = difference.each_ref().map(|d| means(self.width, d));
-        let varies = variance(self.width, &difference);
-        let square = |i: usize| varies[i] + shade.iter().map(|s| s[i] * s[i]).sum::<f32>();
+        let shade = difference.each_ref().map(|d| patch_means(self.width, d));
+        let difference_variance = patch_variance(self.width, &difference);
+        let square = |i: usize| difference_variance[i] + shade.iter().map(|s| s[i] * s[i]).sum::<f32>();
         let label = |i: usize| {
             let texture = texture[i].max(self.texture[i]);
-            let is_shade = shade.iter().all(|s| s[i].abs() < SHADE);
-            if varies[i] < STILL * texture
-                && texture > 3.0 * TEXTURE * TEXTURE
-                && is_shade
-                && self.support[i] >= SUPPORT
+            let is_shaded = shade.iter().all(|s| s[i].abs() < MAX_SHADE_DIFFERENCE);
+            if difference_variance[i] < MAX_STILL_VARIANCE_RATIO * texture
+                && texture > 3.0 * MIN_TEXTURE_DEVIATION * MIN_TEXTURE_DEVIATION
+                && is_shaded
+                && self.support[i] >= MIN_SUPPORT
             {
                 Label::Still
-            } else if square(i) > MOVES * texture && square(i) > 3.0 * DIFFERS * DIFFERS {
+            } else if square(i) > MIN_MOVING_VARIANCE_RATIO * texture
+                && square(i) > 3.0 * MIN_MOVING_DIFFERENCE * MIN_MOVING_DIFFERENCE
+            {
                 Label::Moving
             } else {
-                Label::Open
+                Label::Undecided
             }
         };
         let mut labels: Vec<Label> = (0..texture.len()).map(label).collect();
         let of_still = (0..labels.len()).filter(|i| labels[*i] == Label::Still).map(square);
         if let Some(noise) = median(of_still.map(f64::from).collect()) {
             for (i, label) in labels.iter_mut().enumerate() {
-                if *label == Label::Open && self.constant[i] && f64::from(square(i)) < QUIET * noise {
+                if *label == Label::Undecided && self.constant[i] && f64::from(square(i)) < MAX_NOISE_RATIO * noise {
                     *label = Label::Quiet;
                 }
             }
@@ -137,7 +140,7 @@ impl StillScene {
     }
 
     /// Brightness of each channel of a photograph relative to this scene, where the photograph shows it.
-    fn light(&self, color: &[Vec<f32>; 3], labels: &[Label]) -> [f32; 3] {
+    fn channel_gains(&self, color: &[Vec<f32>; 3], labels: &[Label]) -> [f32; 3] {
         let sum = |values: &[f32]| -> f32 {
             let of = values.iter().zip(labels).filter(|v| *v.1 == Label::Still);
             of.map(|v| v.0).sum()
@@ -154,15 +157,15 @@ impl StillScene {
 }
 
 /// The parts of a photograph that show a [`StillScene`].
-pub struct Shown {
+pub struct Segmentation {
     width: usize,
     /// `[H, W]`
     labels: Vec<Label>,
 }
 
-impl Shown {
+impl Segmentation {
     /// The fraction of the pixels that stand still with the texture of the scene.
-    pub fn share(&self) -> f64 {
+    pub fn still_fraction(&self) -> f64 {
         let still = self.labels.iter().filter(|label| **label == Label::Still).count();
         still as f64 / self.labels.len() as f64
     }
@@ -170,14 +173,16 @@ impl Shown {
     /// `[H, W]` whether each pixel shows the scene.
     pub fn mask(mut self) -> Vec<bool> {
         let (width, labels) = (self.width, &mut self.labels);
-        let least = (SPECK * labels.len() as f64) as usize;
-        join(width, labels, BESIDE, |label, _| label == Label::Quiet);
+        let min_pixels = (MIN_REGION_FRACTION * labels.len() as f64) as usize;
+        relabel_regions(width, labels, MIN_STILL_BORDER_FRACTION, |label, _| {
+            label == Label::Quiet
+        });
         // The remaining quiet regions have no labelled pixels around them.
-        (labels.iter_mut().filter(|label| **label == Label::Quiet)).for_each(|label| *label = Label::Open);
-        join(width, labels, 0.5, |label, _| label == Label::Open);
-        smooth(width, labels);
-        join(width, labels, 0.5, |_, pixels| pixels < least);
-        grown(width, labels)
+        (labels.iter_mut().filter(|label| **label == Label::Quiet)).for_each(|label| *label = Label::Undecided);
+        relabel_regions(width, labels, 0.5, |label, _| label == Label::Undecided);
+        majority_filter(width, labels);
+        relabel_regions(width, labels, 0.5, |_, pixels| pixels < min_pixels);
+        dilated(width, labels)
     }
 }
 
@@ -192,8 +197,8 @@ struct Mode {
 
 impl Mode {
     /// The mode of `colors`, the first of several equal ones.
-    fn of(colors: &[[u8; 3]]) -> Self {
-        let same = |a: &[u8; 3], b: &[u8; 3]| a.iter().zip(b).all(|(a, b)| a.abs_diff(*b) <= SAME);
+    fn from_colors(colors: &[[u8; 3]]) -> Self {
+        let same = |a: &[u8; 3], b: &[u8; 3]| a.iter().zip(b).all(|(a, b)| a.abs_diff(*b) <= MAX_COLOR_DIFFERENCE);
         let count = |a: &[u8; 3]| colors.iter().filter(|b| same(a, b)).count();
         let more = |most: (usize, [u8; 3]), next: (usize, [u8; 3])| if next.0 > most.0 { next } else { most };
         let (n, center) = colors.iter().map(|a| (count(a), *a)).fold((0, [0; 3]), more);
@@ -218,7 +223,7 @@ impl Mode {
 /// When there is no picture, or one does not have `width * height` pixels.
 pub(crate) fn samples(width: usize, height: usize, pictures: &[impl AsRef<[u8]>]) -> Vec<&[u8]> {
     assert!(!pictures.is_empty() && pictures.iter().all(|p| p.as_ref().len() == 3 * width * height));
-    let count = pictures.len().min(SAMPLES);
+    let count = pictures.len().min(MAX_SAMPLED_PHOTOS);
     let even = (0..count).map(|i| pictures[i * pictures.len() / count].as_ref());
     even.collect()
 }
@@ -228,9 +233,9 @@ pub(crate) fn channel(picture: &[u8], c: usize) -> Vec<f32> {
 }
 
 /// `[H, W]` the mean over the patch around each pixel.
-pub(crate) fn means(width: usize, values: &[f32]) -> Vec<f32> {
+pub(crate) fn patch_means(width: usize, values: &[f32]) -> Vec<f32> {
     let height = values.len() / width;
-    let patch = |at: usize, of: usize| at.saturating_sub(REACH)..(at + REACH + 1).min(of);
+    let patch = |at: usize, of: usize| at.saturating_sub(PATCH_RADIUS)..(at + PATCH_RADIUS + 1).min(of);
     let mut rows = Vec::with_capacity(values.len());
     for row in values.chunks_exact(width) {
         rows.extend((0..width).map(|x| {
@@ -250,20 +255,28 @@ pub(crate) fn means(width: usize, values: &[f32]) -> Vec<f32> {
 }
 
 /// `[H, W]` the variance over the patch around each pixel, summed over the channels.
-pub(crate) fn variance(width: usize, color: &[Vec<f32>; 3]) -> Vec<f32> {
+pub(crate) fn patch_variance(width: usize, color: &[Vec<f32>; 3]) -> Vec<f32> {
     let squares: Vec<f32> = (0..color[0].len())
         .map(|i| color.iter().map(|c| c[i] * c[i]).sum())
         .collect();
-    let (mut variance, means) = (means(width, &squares), color.each_ref().map(|c| means(width, c)));
+    let (mut variance, means) = (
+        patch_means(width, &squares),
+        color.each_ref().map(|c| patch_means(width, c)),
+    );
     for (i, variance) in variance.iter_mut().enumerate() {
         *variance = (*variance - means.iter().map(|m| m[i] * m[i]).sum::<f32>()).max(0.0);
     }
     variance
 }
 
-/// Relabels each connected region of one label for which `weak(label, pixels)` is true: it stands still if more than the fraction `least`
-/// of the labelled pixels around it do, otherwise it moves.
-fn join(width: usize, labels: &mut [Label], least: f64, weak: impl Fn(Label, usize) -> bool) {
+/// Relabels each connected region of one label for which `is_weak(label, pixels)` is true: it stands still if more than
+/// `min_still_fraction` of the labelled pixels around it do, otherwise it moves.
+fn relabel_regions(
+    width: usize,
+    labels: &mut [Label],
+    min_still_fraction: f64,
+    is_weak: impl Fn(Label, usize) -> bool,
+) {
     let mut seen = vec![false; labels.len()];
     for start in 0..labels.len() {
         if seen[start] {
@@ -284,12 +297,12 @@ fn join(width: usize, labels: &mut [Label], least: f64, weak: impl Fn(Label, usi
                     }
                     Label::Still => around[0] += 1,
                     Label::Moving => around[1] += 1,
-                    Label::Quiet | Label::Open => {}
+                    Label::Quiet | Label::Undecided => {}
                 }
             }
         }
-        if weak(label, region.len()) && around != [0; 2] {
-            let still = around[0] as f64 > least * (around[0] + around[1]) as f64;
+        if is_weak(label, region.len()) && around != [0; 2] {
+            let still = around[0] as f64 > min_still_fraction * (around[0] + around[1]) as f64;
             let joined = if still { Label::Still } else { Label::Moving };
             region.into_iter().for_each(|at| labels[at] = joined);
         }
@@ -309,7 +322,7 @@ pub(crate) fn adjacent(width: usize, pixels: usize, at: usize) -> impl Iterator<
 }
 
 /// Gives each pixel the label of the majority of itself and its four neighbours.
-fn smooth(width: usize, labels: &mut [Label]) {
+fn majority_filter(width: usize, labels: &mut [Label]) {
     let before = labels.to_vec();
     for (at, label) in labels.iter_mut().enumerate() {
         let (mut same, mut other) = (1, 0);
@@ -329,7 +342,7 @@ fn smooth(width: usize, labels: &mut [Label]) {
 }
 
 /// `[H, W]` the pixels that stand still and their neighbours, which show a little of the still scene.
-fn grown(width: usize, labels: &[Label]) -> Vec<bool> {
+fn dilated(width: usize, labels: &[Label]) -> Vec<bool> {
     let is_still = |at: usize| labels[at] == Label::Still;
     let all = 0..labels.len();
     all.map(|at| is_still(at) || adjacent(width, labels.len(), at).any(is_still))
@@ -375,8 +388,8 @@ mod tests {
     }
 
     fn masks(pictures: &[Vec<u8>]) -> Vec<Vec<bool>> {
-        let still = StillScene::of(SIDE, SIDE, pictures);
-        pictures.iter().map(|picture| still.shown(picture).mask()).collect()
+        let still = StillScene::from_pictures(SIDE, SIDE, pictures);
+        pictures.iter().map(|picture| still.segment(picture).mask()).collect()
     }
 
     /// The fractions of the background and of the disc that are masked.
@@ -404,9 +417,9 @@ mod tests {
         let [behind, disc] = masked(&turntable(20, textured, |_| 1.0));
         assert!(behind > 0.98 && disc < 0.02, "{behind} {disc}");
         let pictures = turntable(20, textured, |_| 1.0);
-        let still = StillScene::of(SIDE, SIDE, &pictures);
+        let still = StillScene::from_pictures(SIDE, SIDE, &pictures);
         let other = turntable(1, |x, y, _| noise(3, x / 4, y / 4).min(250), |_| 1.0).remove(0);
-        let shares = [&pictures[7], &other].map(|picture| still.shown(picture).share());
+        let shares = [&pictures[7], &other].map(|picture| still.segment(picture).still_fraction());
         assert!(shares[0] > 0.5 && shares[1] < 0.05, "{shares:?}");
         // In light that changes from photograph to photograph, and with a plain part surrounded by texture.
         let plain = |x: usize, y: usize, _: usize| {

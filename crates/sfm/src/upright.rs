@@ -6,11 +6,11 @@ use crate::median;
 use glam::{DQuat, DVec3};
 
 /// Maximum standard deviation of the viewing directions of a survey about their mean, degrees.
-const PARALLEL: f64 = 15.0;
+const MAX_VIEW_DEVIATION_DEGREES: f64 = 15.0;
 /// Minimum standard deviation of the positions of its cameras perpendicular to their views, in the direction in which it is smallest,
 /// relative to the distance of the points. Of 50 captures, those by kite and by drone have 0.27 and 0.47 (12 and 3 degrees); those that
 /// look ahead almost as much in parallel have up to 0.21.
-const SPREAD: f64 = 0.25;
+const MIN_POSITION_SPREAD: f64 = 0.25;
 
 /// The up direction, from the rotation of each camera to the world and the up direction in its own axes, if known: most photographs are
 /// level, so all their x axes are in one horizontal plane.
@@ -50,17 +50,17 @@ pub struct Survey {
 pub fn survey(cameras: &[DPose], points: impl Iterator<Item = DVec3>) -> Option<Survey> {
     let n = cameras.len() as f64;
     let forward = (cameras.iter().map(|pose| pose.rotation * DVec3::Z).sum::<DVec3>()).try_normalize()?;
-    let off = |pose: &DPose| (pose.rotation * DVec3::Z).angle_between(forward).to_degrees().powi(2);
-    let apart = (cameras.iter().map(off).sum::<f64>() / n).sqrt();
-    if apart >= PARALLEL {
+    let squared_deviation = |pose: &DPose| (pose.rotation * DVec3::Z).angle_between(forward).to_degrees().powi(2);
+    let deviation = (cameras.iter().map(squared_deviation).sum::<f64>() / n).sqrt();
+    if deviation >= MAX_VIEW_DEVIATION_DEGREES {
         return None;
     }
     let mean = cameras.iter().map(|pose| pose.position).sum::<DVec3>() / n;
     let depth = median(points.map(|point| (point - mean).dot(forward)).collect())?;
-    let across = (cameras.iter()).map(|pose| (pose.position - mean).reject_from_normalized(forward));
+    let offsets = (cameras.iter()).map(|pose| (pose.position - mean).reject_from_normalized(forward));
     // The first eigenvalue is the one along the views.
-    let ([_, narrow, _], _) = symmetric_eigen(scatter(across));
-    (depth > 0.0 && (narrow / n).sqrt() > SPREAD * depth).then_some(Survey {
+    let ([_, minor_variance, _], _) = symmetric_eigen(scatter(offsets));
+    (depth > 0.0 && (minor_variance / n).sqrt() > MIN_POSITION_SPREAD * depth).then_some(Survey {
         up: -forward,
         center: mean + depth * forward,
     })

@@ -33,16 +33,16 @@ fn examine(world: &World, appearances: &[Appearance], colors: &[Vec<[u8; 3]>]) -
         models: &found.models,
         zooms: &found.zooms,
         own_focals: found.own_focals,
-        absent: &found.absent,
-        apart: found.apart,
+        missing: &found.missing,
+        split_models: found.split_models,
         left_out: &found.left_out,
     };
     let alone = Evidence {
         models: &[],
         zooms: &[],
         own_focals: false,
-        absent: &[],
-        apart: None,
+        missing: &[],
+        split_models: None,
         left_out: &[],
         ..evidence
     };
@@ -61,7 +61,7 @@ fn grey(world: &World) -> Vec<Vec<[u8; 3]>> {
         .collect()
 }
 
-fn plainly(world: &World) -> [Vec<Diagnosis>; 2] {
+fn examine_plain(world: &World) -> [Vec<Diagnosis>; 2] {
     examine(world, &sharp(world), &grey(world))
 }
 
@@ -69,19 +69,19 @@ fn kinds(found: &[Diagnosis]) -> Vec<Kind> {
     found.iter().map(Diagnosis::kind).collect()
 }
 
-/// A ring of `n` around a scene of `points`, without the photographs `gone`.
-fn ring(n: usize, points: usize, gone: std::ops::Range<usize>) -> World {
+/// A ring of `n` around a scene of `points`, without the photographs `missing`.
+fn ring(n: usize, points: usize, missing: std::ops::Range<usize>) -> World {
     let poses = around(n, 1.0)
         .into_iter()
         .enumerate()
-        .filter(|(i, _)| !gone.contains(i))
+        .filter(|(i, _)| !missing.contains(i))
         .map(|p| p.1);
     World::new(poses.collect(), points, 0.5, 0.1, 21)
 }
 
 #[test]
 fn nothing_is_wrong_with_a_good_ring() {
-    for found in plainly(&ring(24, 2500, 0..0)) {
+    for found in examine_plain(&ring(24, 2500, 0..0)) {
         assert_eq!(found, []);
     }
 }
@@ -119,8 +119,8 @@ fn photographs_are_compared_with_their_neighbours() {
 #[test]
 fn a_gap_in_a_ring_and_an_open_loop_are_told_apart() {
     // 7.5 degrees between photographs; facing points are seen over about 50 degrees.
-    for (gone, kind, width) in [(10..20, Kind::Gap, 82.5), (44..48, Kind::OpenLoop, 37.5)] {
-        let mut world = ring(48, 2500, gone.clone());
+    for (missing, kind, width) in [(10..20, Kind::Gap, 82.5), (44..48, Kind::OpenLoop, 37.5)] {
+        let mut world = ring(48, 2500, missing.clone());
         // Features match over 30 degrees at most.
         let azimuth = |pose: &DPose| pose.position.y.atan2(pose.position.x);
         let poses = world.poses.clone();
@@ -128,7 +128,7 @@ fn a_gap_in_a_ring_and_an_open_loop_are_told_apart() {
             let [a, b] = pair.photos.map(|p| azimuth(&poses[p as usize]));
             (a - b).sin().atan2((a - b).cos()).abs() < 0.53
         });
-        for found in plainly(&world) {
+        for found in examine_plain(&world) {
             assert!(kinds(&found).contains(&kind), "{found:?}");
             let degrees = found.iter().find_map(|diagnosis| match diagnosis {
                 Diagnosis::Gap { degrees, .. } | Diagnosis::OpenLoop { degrees, .. } => Some(*degrees),
@@ -142,7 +142,7 @@ fn a_gap_in_a_ring_and_an_open_loop_are_told_apart() {
 #[test]
 fn two_scenes_are_separate_parts() {
     let world = World::new(around(10, 0.4), 900, 0.5, 0.2, 3).and(World::new(around(6, 0.3), 900, 0.5, 0.2, 4));
-    let [_, alone] = plainly(&world);
+    let [_, alone] = examine_plain(&world);
     let parts = alone.iter().find_map(|d| match d {
         Diagnosis::SeparateParts { parts } => Some(parts.clone()),
         _ => None,
@@ -158,7 +158,7 @@ fn turning_on_the_spot_is_named_and_is_the_one_reason() {
         ..here
     };
     let world = World::new((0..8).map(turned).collect(), 1500, 0.3, 0.1, 5);
-    let [mapped, alone] = plainly(&world);
+    let [mapped, alone] = examine_plain(&world);
     assert!(kinds(&alone).contains(&Kind::RotationOnly), "{alone:?}");
     let reasons: Vec<&Diagnosis> = mapped.iter().filter(|d| d.kind() == Kind::LeftOut).collect();
     assert_eq!(reasons.len(), 8);
@@ -191,12 +191,12 @@ fn a_turn_on_the_spot_between_two_walks_is_why_there_are_two_models() {
         })
         .collect();
     let world = World::of_points(CAMERA, poses.collect(), &points, 0, 0.5, 0.1, 8);
-    let [mapped, _] = plainly(&world);
+    let [mapped, _] = examine_plain(&world);
     let turns: Vec<&Diagnosis> = mapped
         .iter()
-        .filter(|found| matches!(found, Diagnosis::TurnOnly { .. }))
+        .filter(|found| matches!(found, Diagnosis::RotationBetweenModels { .. }))
         .collect();
-    let [Diagnosis::TurnOnly { ends, sides }] = turns[..] else {
+    let [Diagnosis::RotationBetweenModels { ends, sides }] = turns[..] else {
         panic!("{mapped:?}")
     };
     let in_turn = walk as usize..=(walk + turn) as usize;
@@ -229,10 +229,10 @@ fn a_photograph_taken_twice_is_named_once() {
         photos: [3, last],
         matches: (0..world.features[3].keypoints.len() as u32).map(|i| [i, i]).collect(),
     });
-    for found in plainly(&world) {
+    for found in examine_plain(&world) {
         assert_eq!(
             found,
-            [Diagnosis::Twice {
+            [Diagnosis::Duplicate {
                 photos: [3, last as usize]
             }]
         );
@@ -248,7 +248,7 @@ fn little_texture_and_few_partners_are_named() {
         let side = usize::from(pair.photos[1] == 7);
         pair.matches.retain(|m| m[side] < 40);
     }
-    for found in plainly(&world) {
+    for found in examine_plain(&world) {
         assert!(
             found.iter().any(|d| matches!(
                 d,
@@ -273,7 +273,7 @@ fn little_texture_and_few_partners_are_named() {
 #[test]
 fn a_zoom_that_no_metadata_tell_is_named_and_mapped_with_its_own_focal_length() {
     let world = ring(24, 2500, 0..0).zoomed(15, 1.5);
-    let [mapped, alone] = plainly(&world);
+    let [mapped, alone] = examine_plain(&world);
     assert_eq!(alone, []);
     let [Diagnosis::Zoom { photos, ratio }] = &mapped[..] else {
         panic!("{mapped:?}");
@@ -310,7 +310,7 @@ fn focal_lengths_that_differ_from_photograph_to_photograph_make_as_many_cameras(
     let mut photos = world.photos.clone();
     found.regroup(&mut photos);
     assert!(photos.iter().enumerate().all(|(i, photo)| photo.group == i));
-    let [mapped, _] = plainly(&world);
+    let [mapped, _] = examine_plain(&world);
     assert!(
         mapped
             .iter()
@@ -322,17 +322,17 @@ fn focal_lengths_that_differ_from_photograph_to_photograph_make_as_many_cameras(
 #[test]
 fn photographs_cut_beside_their_middles_are_named() {
     let all = ring(24, 2500, 0..0);
-    let corner = all.clone().cut_beside(|_| 0.8, |_| [0.0, 1.0]);
-    for (world, beside) in [(all.cut(|_| 0.8), None), (corner, Some(100.0f64.hypot(75.0)))] {
-        let [mapped, alone] = plainly(&world);
-        let cut = |found: &[Diagnosis]| {
+    let corner = all.clone().cropped_beside(|_| 0.8, |_| [0.0, 1.0]);
+    for (world, beside) in [(all.cropped(|_| 0.8), None), (corner, Some(100.0f64.hypot(75.0)))] {
+        let [mapped, alone] = examine_plain(&world);
+        let cropped = |found: &[Diagnosis]| {
             found.iter().find_map(|d| match d {
-                Diagnosis::Cut { photos, distance } => Some((photos.len(), *distance)),
+                Diagnosis::Cropped { photos, distance } => Some((photos.len(), *distance)),
                 _ => None,
             })
         };
-        assert_eq!(cut(&alone), None);
-        match (cut(&mapped), beside) {
+        assert_eq!(cropped(&alone), None);
+        match (cropped(&mapped), beside) {
             (None, None) => (),
             (Some((24, found)), Some(truth)) => assert!((found - truth).abs() < 20.0, "{found}"),
             (found, truth) => panic!("{found:?} is not {truth:?}"),
@@ -349,7 +349,7 @@ fn a_zoom_so_far_that_nothing_matches_is_named_from_both_models() {
     let found = world.map();
     let sizes: Vec<usize> = found.models.iter().map(Model::registered).collect();
     assert_eq!(sizes, [14, 10]);
-    let [mapped, _] = plainly(&world);
+    let [mapped, _] = examine_plain(&world);
     let zoom = mapped.iter().find_map(|diagnosis| match diagnosis {
         Diagnosis::Zoom { photos, ratio } => Some((photos.clone(), *ratio)),
         _ => None,
@@ -374,25 +374,25 @@ fn a_background_with_most_of_the_features_stands_still() {
         matches: (0..count).map(|i| [i, i]).collect(),
     };
     world.pairs = (0..12).map(|i| all([i, i + 1])).collect();
-    let [_, alone] = plainly(&world);
+    let [_, alone] = examine_plain(&world);
     let still = alone
         .iter()
-        .find(|diagnosis| matches!(diagnosis, Diagnosis::StandsStill { .. }));
+        .find(|diagnosis| matches!(diagnosis, Diagnosis::StillRegion { .. }));
     // The photographs at both ends of the chain have one partner.
     let named = (1..12).chain([0, 12]).collect();
     assert_eq!(still.map(Diagnosis::photos), Some(named), "{alone:?}");
     assert!(
         !alone
             .iter()
-            .any(|diagnosis| matches!(diagnosis, Diagnosis::Twice { .. })),
+            .any(|diagnosis| matches!(diagnosis, Diagnosis::Duplicate { .. })),
         "{alone:?}"
     );
     // Two shots of each place are no background.
     world.pairs = (0..12).map(|i| all([2 * i, 2 * i + 1])).collect();
-    let [_, alone] = plainly(&world);
+    let [_, alone] = examine_plain(&world);
     let twice = alone
         .iter()
-        .filter(|diagnosis| matches!(diagnosis, Diagnosis::Twice { .. }));
+        .filter(|diagnosis| matches!(diagnosis, Diagnosis::Duplicate { .. }));
     assert_eq!(twice.count(), 12, "{alone:?}");
 }
 
@@ -407,10 +407,10 @@ fn a_mask_that_hides_all_is_named_in_place_of_darkness_and_texture() {
     // Hidden parts of a photograph with features are not a fault.
     appearances[11].hidden = 0.95;
     for found in examine(&world, &appearances, &grey(&world)) {
-        let looks = [Kind::Hidden, Kind::FewFeatures, Kind::Exposure, Kind::Blurred];
-        let told: Vec<&Diagnosis> = found.iter().filter(|d| looks.contains(&d.kind())).collect();
+        let kinds_of_photo = [Kind::Hidden, Kind::FewFeatures, Kind::Exposure, Kind::Blurred];
+        let reported: Vec<&Diagnosis> = found.iter().filter(|d| kinds_of_photo.contains(&d.kind())).collect();
         assert!(
-            matches!(told[..], [Diagnosis::Hidden { photo: 7, fraction }] if *fraction == 1.0),
+            matches!(reported[..], [Diagnosis::Hidden { photo: 7, fraction }] if *fraction == 1.0),
             "{found:?}"
         );
     }
@@ -419,10 +419,10 @@ fn a_mask_that_hides_all_is_named_in_place_of_darkness_and_texture() {
 #[test]
 fn nothing_and_one_photograph_have_nothing_wrong() {
     let world = World::default();
-    assert_eq!(plainly(&world), [Vec::new(), Vec::new()]);
+    assert_eq!(examine_plain(&world), [Vec::new(), Vec::new()]);
     let mut one = ring(24, 100, 1..24);
     one.features[0] = Features::default();
-    let [found, _] = plainly(&one);
+    let [found, _] = examine_plain(&one);
     assert!(
         kinds(&found)
             .iter()
@@ -452,7 +452,7 @@ fn something_that_moves_is_named_and_nothing_else() {
         let [a, b] = pair.photos.map(|p| first[p as usize]);
         pair.matches.extend((0..thing.len() as u32).map(|i| [a + i, b + i]));
     }
-    for found in plainly(&world) {
+    for found in examine_plain(&world) {
         assert!(
             matches!(&found[..], [Diagnosis::Moving { pairs: [found, of], .. }] if 2 * found > *of),
             "{found:?}"
@@ -484,7 +484,7 @@ fn what_stands_on_a_flat_ground_does_not_move() {
         0.0,
         21,
     );
-    for found in plainly(&world) {
+    for found in examine_plain(&world) {
         assert!(!kinds(&found).contains(&Kind::Moving), "{found:?}");
     }
 }
@@ -508,7 +508,7 @@ fn places_that_are_one_by_a_part_alone_are_mapped_apart() {
     });
     let poses = first.iter().copied().chain(second).collect();
     let world = World::of_points(world::CAMERA, poses, &points, 160, 0.5, 0.0, 21);
-    let [found, alone] = plainly(&world);
+    let [found, alone] = examine_plain(&world);
     assert!(
         matches!(&found[..], [Diagnosis::Missing { photos, models: 2, .. }] if photos.len() == 32),
         "{found:?}"

@@ -6,7 +6,7 @@ use glam::{DVec2, DVec3};
 use irradia_scene::Rng;
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::geometry::pose::DPose;
-use irradia_sfm::map::{MapOptions, PhotoInfo, Source, verify};
+use irradia_sfm::map::{FocalSource, MapOptions, PhotoInfo, verify};
 use world::{CAMERA, World, around, look};
 
 #[test]
@@ -23,9 +23,9 @@ fn principal_points_of_photographs_cut_beside_their_middles_are_found() {
     };
     let same = |_| [0.1, 0.8];
     let own = |photo: usize| corners[photo % 5];
-    let shared = alike(all.clone().cut_beside(|_| 0.8, same));
+    let shared = alike(all.clone().cropped_beside(|_| 0.8, same));
     // With one photograph per camera, the lens's distortion stays unknown.
-    let each = all.cut_beside(|_| 0.8, own);
+    let each = all.cropped_beside(|_| 0.8, own);
     for (world, before, least, off) in [
         (shared, &same as &dyn Fn(usize) -> [f64; 2], [95.0, 99.0], 3.0),
         (each, &own, [10.0, 70.0], 15.0),
@@ -123,7 +123,7 @@ fn the_pairs_tell_the_focal_length_of_narrow_and_of_very_wide_views() {
         let options = MapOptions::default();
         let (cameras, _) = verify(&world.photos, &world.features, &world.pairs, &options, &mut |_| ());
         let (found, source) = cameras[0];
-        assert_eq!(source, Source::Pairs, "{by_side}");
+        assert_eq!(source, FocalSource::Pairs, "{by_side}");
         assert!(
             (found.focal() / focal - 1.0).abs() < 0.1,
             "{by_side}: {}",
@@ -137,7 +137,7 @@ fn photographs_of_as_many_cameras_get_their_own_focal_lengths() {
     for seed in [1, 2] {
         let mut rng = Rng::new(seed, 9);
         let keep: Vec<f64> = (0..20).map(|_| f64::from(rng.range(0.65, 1.0))).collect();
-        let world = World::new(around(20, 1.0), 3000, 0.5, 0.2, seed).cut(|photo| keep[photo]);
+        let world = World::new(around(20, 1.0), 3000, 0.5, 0.2, seed).cropped(|photo| keep[photo]);
         let result = world.map();
         let model = &result.models[0];
         assert_eq!(model.registered(), 20);

@@ -7,9 +7,9 @@ use irradia_scene::Rng;
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::geometry::pose::DPose;
 use irradia_sfm::map::{
-    Distance, Known, MapOptions, Model, ModelPoint, Mount, PairKind, PhotoInfo, Reason, Reconstruction,
-    add_guided_points, agreement, complete, determines_focal, extend, reconstruct, same_place, stands_still,
-    to_distances, verify,
+    Distance, KnownGeometry, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, Reason, Reconstruction, RigMount,
+    add_guided_points, agreement, complete, determines_focal, duplicate_pairs, extend, find_still_region, reconstruct,
+    scale_to_distances, verify,
 };
 use irradia_sfm::{DESCRIPTOR_BYTES, Features, Keypoint, PairMatches};
 use std::f64::consts::{FRAC_PI_2, PI};
@@ -61,7 +61,7 @@ fn photographs_are_registered_into_a_known_model_that_stays_as_it_is() {
     for photo in &mut world.photos[20..] {
         photo.group = 1;
     }
-    let known = Known {
+    let known = KnownGeometry {
         poses: (0..24).map(|i| (i < 16).then_some(world.poses[i])).collect(),
         cameras: vec![Some(world::CAMERA), None],
     };
@@ -118,7 +118,7 @@ fn a_model_is_completed_and_another_beside_it_stays() {
 
 /// A wavy wall in front of `photos` cameras 9 degrees apart, on which each descriptor is shared by four points far from each other: its
 /// points, its photographs with their features, and the point of each keypoint.
-fn wall_of_look_alikes(photos: usize) -> (Vec<DVec3>, Vec<PhotoInfo>, Vec<Features>, Vec<Vec<usize>>) {
+fn repetitive_wall(photos: usize) -> (Vec<DVec3>, Vec<PhotoInfo>, Vec<Features>, Vec<Vec<usize>>) {
     let mut rng = Rng::new(5, 0);
     let wall: Vec<DVec3> = (0..400)
         .map(|_| {
@@ -172,7 +172,7 @@ fn photo() -> PhotoInfo {
 
 #[test]
 fn a_verified_pair_gains_the_look_alikes_along_its_lines() {
-    let (_, photos, features, shown) = wall_of_look_alikes(2);
+    let (_, photos, features, shown) = repetitive_wall(2);
     let right = |[i, j]: &[u32; 2]| shown[0][*i as usize] == shown[1][*j as usize];
     let all: Vec<[u32; 2]> = (0..shown[0].len() as u32)
         .flat_map(|i| (0..shown[1].len() as u32).map(move |j| [i, j]))
@@ -203,7 +203,7 @@ fn a_verified_pair_gains_the_look_alikes_along_its_lines() {
 
 #[test]
 fn look_alikes_match_along_the_lines_of_known_poses() {
-    let (wall, photos, features, shown) = wall_of_look_alikes(6);
+    let (wall, photos, features, shown) = repetitive_wall(6);
     let known = ModelPoint {
         position: DVec3::new(9.0, 9.0, 9.0),
         error: 0.5,
@@ -247,11 +247,11 @@ fn look_alikes_match_along_the_lines_of_known_poses() {
 }
 
 /// A world in which every photograph has the same `still` keypoints at the same positions, matched in all pairs.
-fn behind_glass(still: usize) -> World {
+fn world_with_still_points(still: usize) -> World {
     let mut world = World::new(around(24, 1.0), 1500, 0.5, 0.2, 1);
     let mut rng = Rng::new(11, 0);
     let [width, height] = [CAMERA.width, CAMERA.height].map(|side| side as f32);
-    let on_the_glass: Vec<Keypoint> = (0..still)
+    let still_points: Vec<Keypoint> = (0..still)
         .map(|_| Keypoint {
             x: rng.range(0.0, width),
             y: rng.range(0.0, height),
@@ -261,7 +261,7 @@ fn behind_glass(still: usize) -> World {
         .collect();
     let first: Vec<u32> = world.features.iter().map(|of| of.keypoints.len() as u32).collect();
     for features in &mut world.features {
-        features.keypoints.extend(&on_the_glass);
+        features.keypoints.extend(&still_points);
         features.descriptors.extend(vec![[0; DESCRIPTOR_BYTES]; still]);
     }
     for pair in &mut world.pairs {
@@ -273,18 +273,18 @@ fn behind_glass(still: usize) -> World {
 
 #[test]
 fn poses_follow_what_moves_and_not_what_stands_still() {
-    let world = behind_glass(400);
+    let world = world_with_still_points(400);
     let most = world.pairs.iter().filter(|pair| pair.matches.len() < 800).count();
     assert!(2 * most > world.pairs.len(), "most matches stand still in most pairs");
-    let found = stands_still(&world.photos, &world.features, &world.pairs).expect("400 keypoints stand still");
+    let found = find_still_region(&world.photos, &world.features, &world.pairs).expect("400 keypoints stand still");
     assert!(found.fraction > 0.5, "{found:?}");
     let result = world.map();
     let model = &result.models[0];
     assert_eq!(model.registered(), 24);
     assert!(world.auc(model, 1.0) > 90.0, "{}", world.auc(model, 1.0));
-    let clean = behind_glass(0);
-    assert_eq!(stands_still(&clean.photos, &clean.features, &clean.pairs), None);
-    assert!(same_place(&clean.photos, &clean.features, &clean.pairs).is_empty());
+    let clean = world_with_still_points(0);
+    assert_eq!(find_still_region(&clean.photos, &clean.features, &clean.pairs), None);
+    assert!(duplicate_pairs(&clean.photos, &clean.features, &clean.pairs).is_empty());
 }
 
 /// For cameras that only move sideways, another focal length is equivalent to another depth.
@@ -379,7 +379,7 @@ fn panoramas(count: usize, points: usize) -> World {
         photo.camera = Some(face);
         photo.focal_prior_px = Some(300.0);
         photo.up = Some(turns[i % 6].inverse() * DVec3::NEG_Y);
-        photo.mount = Some(Mount {
+        photo.mount = Some(RigMount {
             rig: i / 6,
             rotation: turns[i % 6],
         });
@@ -619,8 +619,8 @@ fn known_distances_bring_a_model_to_metres_with_an_error_that_holds() {
     };
     // A single distance, whose error only the poses determine; between neighbours it is less certain than between opposite cameras.
     let (mut near, mut across) = (model.clone(), model.clone());
-    let near_fit = to_distances(&mut near, &world.photos, &[distance(3, 4, 1.0)]).expect("posed");
-    let across_fit = to_distances(&mut across, &world.photos, &[distance(3, 11, 1.0)]).expect("posed");
+    let near_fit = scale_to_distances(&mut near, &world.photos, &[distance(3, 4, 1.0)]).expect("posed");
+    let across_fit = scale_to_distances(&mut across, &world.photos, &[distance(3, 11, 1.0)]).expect("posed");
     assert!(near_fit.residual_m < 1e-9 && near_fit.scale_error > 2.0 * across_fit.scale_error);
     assert!(near_fit.scale_error < 0.01, "{near_fit:?}");
     assert!(
@@ -636,7 +636,7 @@ fn known_distances_bring_a_model_to_metres_with_an_error_that_holds() {
     // Several distances that disagree by 3 %.
     let mut several = model.clone();
     let known = [distance(0, 8, 1.03), distance(2, 10, 0.97), distance(4, 12, 1.0)];
-    let fit = to_distances(&mut several, &world.photos, &known).expect("posed");
+    let fit = scale_to_distances(&mut several, &world.photos, &known).expect("posed");
     assert!(
         (0.01..0.03).contains(&fit.scale_error) && (scale_of(&several) - 1.0).abs() < 0.03,
         "{fit:?}"
@@ -645,6 +645,9 @@ fn known_distances_bring_a_model_to_metres_with_an_error_that_holds() {
     let mut turned = model.clone();
     turned.poses[4] = turned.poses[3];
     let before = turned.clone();
-    assert_eq!(to_distances(&mut turned, &world.photos, &[distance(3, 4, 1.0)]), None);
+    assert_eq!(
+        scale_to_distances(&mut turned, &world.photos, &[distance(3, 4, 1.0)]),
+        None
+    );
     assert_eq!(turned, before);
 }

@@ -23,7 +23,7 @@ pub struct Contributions {
 }
 
 /// Backward passes with random signs for each view: the more, the smaller the variance of an estimate.
-const PROBES: u64 = 2;
+const PROBES_PER_VIEW: u64 = 2;
 
 /// Contributions of `splats` to the views of `cameras`, without a smoothing filter. `seed` determines the random signs.
 pub fn contributions(splats: &Splats, cameras: &[Camera], options: &RenderOptions, seed: u64) -> Contributions {
@@ -38,8 +38,8 @@ pub fn contributions(splats: &Splats, cameras: &[Camera], options: &RenderOption
         renderer.render(splats, &ViewParams::new(camera), options);
         let pixels = renderer.alpha().len();
         nothing.resize(pixels, 0.0);
-        for probe in 0..PROBES {
-            let mut rng = Rng::new(seed, PROBES * stream as u64 + probe);
+        for probe in 0..PROBES_PER_VIEW {
+            let mut rng = Rng::new(seed, PROBES_PER_VIEW * stream as u64 + probe);
             signs.clear();
             while signs.len() < 3 * pixels {
                 let bits = rng.next_u32();
@@ -55,7 +55,7 @@ pub fn contributions(splats: &Splats, cameras: &[Camera], options: &RenderOption
             for i in (0..n).filter(|i| gradients.active[*i] > 0.0) {
                 // Where alpha is capped it has no gradient; the bound keeps the remaining gradient from being magnified.
                 let rest = (1.0 - splats.opacity(i)).max(1.0 - ALPHA_MAX as f32);
-                found.change[i] += f64::from(v_logits[i] / rest).powi(2) / PROBES as f64;
+                found.change[i] += f64::from(v_logits[i] / rest).powi(2) / PROBES_PER_VIEW as f64;
                 if probe == 0 {
                     found.weight[i] += f64::from(weights[i]);
                 }
@@ -99,10 +99,10 @@ mod tests {
         let camera = Camera::new(pose, Intrinsics::from_fov_x(64, 64, 0.8));
         let splats = scene(24);
         // One camera many times: the mean of many estimates, whose relative deviation is sqrt(2 / 600) or 6 %.
-        const TIMES: usize = 300;
-        let found = contributions(&splats, &[camera; TIMES], &RenderOptions::default(), 7);
+        const COPIES: usize = 300;
+        let found = contributions(&splats, &[camera; COPIES], &RenderOptions::default(), 7);
         let (whole, alpha) = picture(&splats, &camera);
-        let weight: f64 = found.weight.iter().sum::<f64>() / TIMES as f64;
+        let weight: f64 = found.weight.iter().sum::<f64>() / COPIES as f64;
         assert!(
             (weight / alpha - 1.0).abs() < 1e-3,
             "the weights are the alpha: {weight} {alpha}"
@@ -111,7 +111,7 @@ mod tests {
             let others: Vec<u32> = (0..splats.len() as u32).filter(|other| *other != i as u32).collect();
             let (without, _) = picture(&splats.gather(&others), &camera);
             let exact: f64 = whole.iter().zip(&without).map(|(a, b)| f64::from(a - b).powi(2)).sum();
-            let estimate = found.change[i] / TIMES as f64;
+            let estimate = found.change[i] / COPIES as f64;
             assert!(
                 (estimate / exact - 1.0).abs() < 0.3,
                 "splat {i}: {estimate} for {exact}"

@@ -145,11 +145,11 @@ impl Engine {
 
     /// Maximum number of splats: as many as fit in the largest arrays of a GPU, given the last frame's tile entries per splat.
     /// No limit on the CPU.
-    pub fn most_splats(&self) -> usize {
+    pub fn max_splats(&self) -> usize {
         #[cfg(feature = "gpu")]
         if let Some(gpu) = &self.gpu {
             let on_device = gpu.renderer.sh_degree();
-            return gpu.most_splats(self.state.get().map_or(on_device, |state| state.splats.sh_degree()));
+            return gpu.max_splats(self.state.get().map_or(on_device, |state| state.splats.sh_degree()));
         }
         usize::MAX
     }
@@ -235,7 +235,7 @@ impl Engine {
     fn set_filter(&mut self) {
         self.state();
         let filter = if self.filters {
-            known(&self.state).filter.plane(0)
+            cpu_state(&self.state).filter.plane(0)
         } else {
             &[]
         };
@@ -260,12 +260,12 @@ impl Engine {
             return;
         }
         self.update_bounds();
-        let (splats, bounds) = placed(known(&self.state), self.moved.as_ref(), &self.bounds);
+        let (splats, bounds) = placed_splats(cpu_state(&self.state), self.moved.as_ref(), &self.bounds);
         self.renderer.render_within(splats, bounds, view, options);
     }
 
     /// Begins a frame of the state's splats on the GPU, without waiting for the numbers of visible splats and of entries: until
-    /// [`Self::settle`], only the device knows them.
+    /// [`Self::finish_frame`], only the device knows them.
     ///
     /// # Panics
     /// When the engine is on the CPU.
@@ -279,8 +279,8 @@ impl Engine {
     /// derived from it are void: the backward pass and the update have changed nothing, and must be repeated after another frame.
     #[cfg(feature = "gpu")]
     #[must_use]
-    pub fn settle(&mut self) -> bool {
-        self.gpu.as_mut().is_none_or(|gpu| gpu.renderer.settle())
+    pub fn finish_frame(&mut self) -> bool {
+        self.gpu.as_mut().is_none_or(|gpu| gpu.renderer.finish_frame())
     }
 
     /// The GPU's training, with the latest state.
@@ -299,7 +299,7 @@ impl Engine {
         self.use_cpu();
         self.moved = placement.moved;
         self.update_bounds();
-        let (splats, bounds) = placed(known(&self.state), self.moved.as_ref(), &self.bounds);
+        let (splats, bounds) = placed_splats(cpu_state(&self.state), self.moved.as_ref(), &self.bounds);
         self.renderer
             .project_within(splats, bounds, &ViewParams::new(&placement.camera), options);
     }
@@ -308,8 +308,12 @@ impl Engine {
     fn update_bounds(&mut self) {
         if self.moved.is_none() && std::mem::take(&mut self.edited) {
             let renderer = &self.renderer;
-            self.bounds
-                .update(renderer.level, &known(&self.state).splats, renderer.filter(), |_| true);
+            self.bounds.update(
+                renderer.level,
+                &cpu_state(&self.state).splats,
+                renderer.filter(),
+                |_| true,
+            );
         }
     }
 
@@ -377,7 +381,7 @@ impl Engine {
         if let Some(gpu) = &mut self.gpu {
             return gpu.backward(v_out);
         }
-        let splats = self.moved.as_ref().unwrap_or(&known(&self.state).splats);
+        let splats = self.moved.as_ref().unwrap_or(&cpu_state(&self.state).splats);
         self.renderer.backward(splats, v_out, &mut self.gradients);
     }
 
@@ -502,17 +506,17 @@ impl Engine {
 
     /// The splats of the last frame.
     fn rendered(&self) -> &Splats {
-        self.moved.as_ref().unwrap_or(&known(&self.state).splats)
+        self.moved.as_ref().unwrap_or(&cpu_state(&self.state).splats)
     }
 }
 
 /// The state of an engine on the CPU.
-fn known(state: &OnceLock<SplatState>) -> &SplatState {
+fn cpu_state(state: &OnceLock<SplatState>) -> &SplatState {
     state.get().expect("on the CPU the state is here")
 }
 
 /// The splats of a frame, and their bounds if they have any.
-fn placed<'a>(
+fn placed_splats<'a>(
     state: &'a SplatState,
     moved: Option<&'a Splats>,
     bounds: &'a ChunkBounds,

@@ -5,9 +5,9 @@ use crate::{SplatState, Splats, ViewParams, logit, sigmoid};
 use rayon::prelude::*;
 
 /// Variance of the filter in units of the squared sampling interval (`s` in eq. 7; 0.2 in the paper).
-const VARIANCE: f64 = 0.2;
+const FILTER_VARIANCE: f64 = 0.2;
 /// A view is included where a centre falls within its image extended by this fraction on each side (the authors' code).
-const MARGIN: f64 = 0.15;
+const IMAGE_MARGIN: f64 = 0.15;
 
 /// Sets `state.filter` from the highest sampling rate, focal length over depth, of each splat over `views`. Splats outside all
 /// views get the coarsest filter of the others.
@@ -19,9 +19,12 @@ pub fn update(state: &mut SplatState, views: &[ViewParams]) {
         .with_min_len(1024)
         .map(|i| {
             let mean: [f64; 3] = std::array::from_fn(|c| f64::from(means.get(c, i)));
-            let rate = views.iter().filter_map(|view| rate(view, mean)).fold(0.0f64, f64::max);
-            if rate > 0.0 {
-                (VARIANCE / (rate * rate)) as f32
+            let sampling_rate = views
+                .iter()
+                .filter_map(|view| sampling_rate(view, mean))
+                .fold(0.0f64, f64::max);
+            if sampling_rate > 0.0 {
+                (FILTER_VARIANCE / (sampling_rate * sampling_rate)) as f32
             } else {
                 0.0
             }
@@ -34,7 +37,7 @@ pub fn update(state: &mut SplatState, views: &[ViewParams]) {
 }
 
 /// Samples per world unit at `mean`, if `view` sees it.
-fn rate(view: &ViewParams, mean: [f64; 3]) -> Option<f64> {
+fn sampling_rate(view: &ViewParams, mean: [f64; 3]) -> Option<f64> {
     let x: [f64; 3] =
         std::array::from_fn(|i| (0..3).map(|j| view.rotation[i][j] * mean[j]).sum::<f64>() + view.translation[i]);
     let (pixel, depth) = match &view.lens {
@@ -45,8 +48,8 @@ fn rate(view: &ViewParams, mean: [f64; 3]) -> Option<f64> {
         ),
     };
     let size = [f64::from(view.width), f64::from(view.height)];
-    let inside =
-        depth > view.near && (0..2).all(|i| (-MARGIN * size[i]..=(1.0 + MARGIN) * size[i]).contains(&pixel[i]));
+    let inside = depth > view.near
+        && (0..2).all(|i| (-IMAGE_MARGIN * size[i]..=(1.0 + IMAGE_MARGIN) * size[i]).contains(&pixel[i]));
     inside.then(|| view.focal[0].max(view.focal[1]) / depth)
 }
 

@@ -128,7 +128,7 @@ pub fn random_points<E, C: Fn(Vec2) -> PixelClass + Sync>(
             candidates
                 .par_iter_mut()
                 .with_min_len(1024)
-                .for_each(|candidate| candidate.look_from(camera, &content));
+                .for_each(|candidate| candidate.observe(camera, &content));
         }
         for (attempt, candidate) in (made..).zip(&candidates) {
             let Some((seen, color)) = candidate.mean_color() else {
@@ -162,7 +162,7 @@ struct Candidate {
 
 impl Candidate {
     /// Adds the observation by `camera`, whose photograph has `content`.
-    fn look_from(&mut self, camera: &Camera, content: &impl Fn(Vec2) -> PixelClass) {
+    fn observe(&mut self, camera: &Camera, content: &impl Fn(Vec2) -> PixelClass) {
         if self.is_outside {
             return;
         }

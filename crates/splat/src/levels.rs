@@ -12,9 +12,9 @@ use glam::{Mat3, Quat, Vec3};
 use rayon::prelude::*;
 
 /// Number of nearest neighbours considered as partners, the splat itself included.
-const NEIGHBOURS: usize = 9;
+const NEIGHBOUR_COUNT: usize = 9;
 /// Largest opacity of a merged splat.
-const MOST_OPAQUE: f32 = 0.999;
+const MAX_OPACITY: f32 = 0.999;
 
 /// The properties of a splat that matter for merging.
 #[derive(Clone, Copy)]
@@ -70,14 +70,14 @@ fn area(scales: Vec3) -> f32 {
     ((a * b).powf(P) + (a * c).powf(P) + (b * c).powf(P)).powf(1.0 / P)
 }
 
-/// Disjoint pairs of neighbours, at most `most`, the cheapest first.
-fn pairs(blobs: &[Blob], most: usize) -> Vec<(u32, u32)> {
+/// Disjoint pairs of neighbours, at most `max_pairs`, the cheapest first.
+fn pairs(blobs: &[Blob], max_pairs: usize) -> Vec<(u32, u32)> {
     let positions: Vec<[f32; 3]> = blobs.iter().map(|blob| blob.mean.to_array()).collect();
     let tree = Nearest::new(&positions);
     let mut candidates: Vec<(f32, u32, u32)> = (0..blobs.len())
         .into_par_iter()
         .flat_map_iter(|i| {
-            let near = tree.of::<NEIGHBOURS>(positions[i]);
+            let near = tree.of::<NEIGHBOUR_COUNT>(positions[i]);
             let others = near.into_iter().map(|(_, other)| other as usize);
             // Mutual neighbours give the same pair twice, which does no harm.
             others
@@ -89,7 +89,7 @@ fn pairs(blobs: &[Blob], most: usize) -> Vec<(u32, u32)> {
     let mut taken = vec![false; blobs.len()];
     let mut pairs = Vec::new();
     for (_, a, b) in candidates {
-        if pairs.len() == most {
+        if pairs.len() == max_pairs {
             break;
         }
         if !taken[a as usize] && !taken[b as usize] {
@@ -104,11 +104,11 @@ fn pairs(blobs: &[Blob], most: usize) -> Vec<(u32, u32)> {
 /// The cost of merging two splats: how far their mass moves (Ward 1963), more if their colours differ.
 fn cost(a: &Blob, b: &Blob) -> f32 {
     let reduced = a.mass * b.mass / (a.mass + b.mass);
-    reduced * a.mean.distance_squared(b.mean) * (COLOR_FLOOR + a.color.distance_squared(b.color))
+    reduced * a.mean.distance_squared(b.mean) * (COLOR_SCALE + a.color.distance_squared(b.color))
 }
 
 /// Squared difference of colours, in coefficients of degree 0, that doubles the cost of the distance.
-const COLOR_FLOOR: f32 = 0.1;
+const COLOR_SCALE: f32 = 0.1;
 
 /// Replaces each pair by its union; keeps the other splats.
 fn unite(splats: &Splats, blobs: &[Blob], pairs: &[(u32, u32)]) -> Splats {
@@ -149,7 +149,7 @@ fn union(a: &Blob, b: &Blob) -> (f32, Vec3, Quat, [f32; 3], f32) {
         (a.covariance + outer(a.mean - mean)) * part + (b.covariance + outer(b.mean - mean)) * (1.0 - part);
     let (rotation, variances) = eigen(covariance);
     let scales = variances.max(Vec3::splat(1e-30)).map(f32::sqrt);
-    let opacity = (total / area(scales)).clamp(1e-4, MOST_OPAQUE);
+    let opacity = (total / area(scales)).clamp(1e-4, MAX_OPACITY);
     (part, mean, rotation, scales.map(f32::ln).to_array(), logit(opacity))
 }
 

@@ -1,7 +1,7 @@
 //! Exact nearest neighbours of points in space: an implicit k-d tree (Bentley 1975), stored as an order of the points.
 
 /// Number of points up to which a subtree is searched linearly.
-const LEAF: usize = 12;
+const LEAF_SIZE: usize = 12;
 
 /// Points `[N, 3]`, all finite, in the order of a balanced k-d tree: the median of each subtree splits the rest along one axis.
 pub struct Nearest {
@@ -29,7 +29,7 @@ impl Nearest {
 }
 
 fn arrange(points: &mut [([f32; 3], u32)], axis: usize) {
-    if points.len() <= LEAF {
+    if points.len() <= LEAF_SIZE {
         return;
     }
     let middle = points.len() / 2;
@@ -40,7 +40,7 @@ fn arrange(points: &mut [([f32; 3], u32)], axis: usize) {
 }
 
 fn search<const K: usize>(points: &[([f32; 3], u32)], axis: usize, at: [f32; 3], best: &mut [Neighbour; K]) {
-    if points.len() <= LEAF {
+    if points.len() <= LEAF_SIZE {
         for point in points {
             insert(point, at, best);
         }
@@ -95,7 +95,7 @@ mod tests {
             &|rng, _| std::array::from_fn(|_| 1e6 + rng.normal()),
         ];
         for make in kinds {
-            for n in [1, 3, LEAF + 1, 700] {
+            for n in [1, 3, LEAF_SIZE + 1, 700] {
                 let positions: Vec<[f32; 3]> = (0..n).map(|i| make(&mut rng, i)).collect();
                 let tree = Nearest::new(&positions);
                 for at in positions.iter().take(100) {

@@ -222,14 +222,14 @@ pub struct AngleCap {
 /// projection, and the approximations for a lens and for a pinhole differ where the splat is large: renders through a fisheye then look
 /// right, and those through a pinhole show veils. `synth`'s room by a fisheye of 190 degrees, held-out views by a pinhole, 1,500 steps:
 /// 32.3 dB without a cap, 36.2, 37.3 and 38.0 with 0.25, 0.15 and 0.1; antialiased 39.3 with 0.1, 39.7 with 0.05.
-const LARGEST_OF_WIDE: f32 = 0.1;
+const MAX_WIDE_LENS_RATIO: f32 = 0.1;
 
 impl AngleCap {
     /// The cap for a step whose photograph was taken by `camera`; `None` unless its lens is wide.
     pub fn of(camera: &Camera) -> Option<Self> {
         camera.intrinsics.lens.is_wide().then(|| Self {
             center: camera.pose.position.to_array(),
-            largest: LARGEST_OF_WIDE,
+            largest: MAX_WIDE_LENS_RATIO,
         })
     }
 }
@@ -312,7 +312,7 @@ mod tests {
     use super::*;
     use irradia_compute::simd::Double;
     use irradia_scene::Rng;
-    use irradia_testkit::differences::Differences;
+    use irradia_testkit::finite_differences::FiniteDifferences;
 
     #[test]
     fn gradients_match_finite_differences() {
@@ -336,9 +336,9 @@ mod tests {
             let (_, v_log_scale, v_logit) = regularizer(&w, [x[0], x[1], x[2]], x[3]);
             let gradient = [v_log_scale[0], v_log_scale[1], v_log_scale[2], v_logit];
             // For values near 1: 1e-10 of curvature, 1e-11 of rounding.
-            let differences = Differences {
+            let differences = FiniteDifferences {
                 absolute: 1e-8,
-                ..Differences::of_largest(1e-5, 0.0)
+                ..FiniteDifferences::relative_to_max(1e-5, 0.0)
             };
             let value = |x: &[f64]| regularizer(&w, [x[0], x[1], x[2]], x[3]).0;
             differences.check(&format!("{weights:?}"), &x, &gradient, 0..4, value);

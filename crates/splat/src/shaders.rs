@@ -68,7 +68,7 @@ pub const STAGES: [Stage; 6] = [
     Stage {
         name: "blend",
         kernels: &["blend"],
-        twin: "render::blend::BlendTile, render::develop",
+        twin: "render::blend::BlendTile, render::untile",
     },
     Stage {
         name: "blend_vjp",
@@ -91,7 +91,7 @@ pub const STAGES: [Stage; 6] = [
 const FRAME: [&str; 7] = ["project", "compact", "count", "emit", "ranges", "segments", "blend"];
 
 /// The source of every kernel of a frame, with those of prefix sums and of the sort.
-pub fn of_a_frame() -> impl Iterator<Item = &'static Shader> {
+pub fn frame_shaders() -> impl Iterator<Item = &'static Shader> {
     let own = SHADERS.iter().filter(|shader| FRAME.contains(&shader.name));
     own.chain(&SCAN).chain(&SORT)
 }

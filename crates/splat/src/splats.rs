@@ -115,6 +115,17 @@ impl Splats {
             .unwrap_or(0)
     }
 
+    /// Highest SH degree with a coefficient other than zero.
+    pub fn used_sh_degree(&self) -> u32 {
+        let is_used = |degree: &u32| {
+            let planes = 3 * sh::coefficients(degree - 1)..3 * sh::coefficients(*degree);
+            planes
+                .into_iter()
+                .any(|c| self.sh.plane(c)[..self.len()].iter().any(|v| *v != 0.0))
+        };
+        (1..=self.sh_degree()).rev().find(is_used).unwrap_or(0)
+    }
+
     pub(crate) fn from_columns([means, quats, log_scales, opacity_logits, sh]: [Planes; 5]) -> Self {
         Self {
             means,

@@ -129,7 +129,7 @@ impl SplatState {
         for (to, from) in self.splats.columns_mut().into_iter().zip(splats.columns()) {
             to.rearrange(&order, &[from], &mut scratch);
         }
-        for column in self.columns_beside_mut() {
+        for column in self.auxiliary_columns_mut() {
             column.rearrange(&order, &[], &mut scratch);
         }
     }
@@ -179,7 +179,7 @@ impl SplatState {
     }
 
     /// Every column but the parameters.
-    fn columns_beside_mut(&mut self) -> Vec<&mut Planes> {
+    fn auxiliary_columns_mut(&mut self) -> Vec<&mut Planes> {
         self.all_columns_mut().split_off(COLUMN_NAMES.len())
     }
 

@@ -18,7 +18,7 @@ const CASES: [&str; 5] = [
 
 /// A gradient's elements must be accurate to two thousandths of their value plus this fraction of the array's largest: the error of
 /// single precision in cancelling sums over hundreds of pixels (1.7e-3 was seen).
-const FLOOR: f64 = 1e-3;
+const GRADIENT_TOLERANCE: f64 = 1e-3;
 
 fn splats(golden: &Golden) -> Splats {
     let columns = |name: &str| golden.get_f32(name);
@@ -71,23 +71,23 @@ fn interleaved(planar: &[f32]) -> Vec<f64> {
         .collect()
 }
 
-fn wide(values: &[f32]) -> Vec<f64> {
+fn widen(values: &[f32]) -> Vec<f64> {
     values.iter().map(|v| f64::from(*v)).collect()
 }
 
 /// 1e-4 would do; 2e-5 is what single precision achieves (golden/README.md).
-const IMAGE: f64 = 2e-5;
+const IMAGE_TOLERANCE: f64 = 2e-5;
 
 fn check_images(case: &str, device: &str, golden: &Golden, frame: FramePlanes) {
     let robust = golden.get("fragile");
     for (name, got, channels, scale) in [
         ("out_rgb", interleaved(frame.color), 3, 1.0),
-        ("out_alpha", wide(frame.alpha), 1, 1.0),
-        ("out_depth_acc", wide(frame.depth), 1, 10.0),
+        ("out_alpha", widen(frame.alpha), 1, 1.0),
+        ("out_depth_acc", widen(frame.depth), 1, 10.0),
     ] {
         let d = max_abs_difference(&got, golden.get(name), |i| robust[i / channels] == 0.0);
         println!("{case} {device} {name}: {:.2e}", d.worst);
-        assert!(d.worst < IMAGE * scale, "{case} {device} {name}: {d:?}");
+        assert!(d.worst < IMAGE_TOLERANCE * scale, "{case} {device} {name}: {d:?}");
     }
 }
 
@@ -106,10 +106,10 @@ fn check_gradients(case: &str, device: &str, set: &str, golden: &Golden, gradien
                 item.fill(0.0);
             }
         }
-        wide(&got)
+        widen(&got)
     };
     let check = |name: &str, got: &[f64], expected: &[f64]| {
-        let d = relative_difference(got, expected, FLOOR);
+        let d = relative_difference(got, expected, GRADIENT_TOLERANCE);
         println!("{case} {device} {set}_{name}: {:.2e}", d.worst);
         assert!(d.worst < 2e-3, "{case} {device} {set}_{name}: {d:?}");
     };

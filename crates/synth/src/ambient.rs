@@ -5,33 +5,33 @@
 
 use crate::scene::{Hit, Light, SynthScene};
 use crate::shape::Shape;
-use crate::texture::smooth;
+use crate::texture::smoothstep;
 use glam::Vec3;
 
 /// Irradiance over pi of everything but the sun, linear RGB, without occlusion.
-pub fn open(light: &Light, hit: &Hit) -> Vec3 {
+pub fn unoccluded(light: &Light, hit: &Hit) -> Vec3 {
     // Close to the table top or the ground, shadows of the objects on it reduce the reflected light.
     let bounce = if hit.point.z > 0.0 {
-        0.35 + 0.65 * smooth(0.0, 0.45, hit.point.z)
+        0.35 + 0.65 * smoothstep(0.0, 0.45, hit.point.z)
     } else {
         0.5
     };
     (light.below * bounce).lerp(light.above, 0.5 + 0.5 * hit.normal.z)
 }
 
-/// As [`open`], less occlusion by the other objects.
-pub fn shaded(scene: &SynthScene, hit: &Hit) -> Vec3 {
+/// As [`unoccluded`], less occlusion by the other objects.
+pub fn occluded(scene: &SynthScene, hit: &Hit) -> Vec3 {
     let mut uncovered = 1.0;
     for (object, _) in scene.clusters.iter().flat_map(|cluster| &cluster.objects) {
         if !std::ptr::eq(object, hit.object) {
-            uncovered *= 1.0 - covered(&object.shape, hit.point, hit.normal);
+            uncovered *= 1.0 - occlusion(&object.shape, hit.point, hit.normal);
         }
     }
-    uncovered * open(&scene.light, hit)
+    uncovered * unoccluded(&scene.light, hit)
 }
 
 /// The cosine-weighted fraction of the hemisphere over `n` that a solid occludes, 0 to 1.
-fn covered(shape: &Shape, point: Vec3, n: Vec3) -> f32 {
+fn occlusion(shape: &Shape, point: Vec3, n: Vec3) -> f32 {
     match *shape {
         // Thin parts occlude almost nothing; the surroundings are the light itself.
         Shape::Ground { .. }
@@ -40,10 +40,10 @@ fn covered(shape: &Shape, point: Vec3, n: Vec3) -> f32 {
         | Shape::Rod { .. }
         | Shape::Ring { .. } => 0.0,
         Shape::Block { half, .. } if half.min_element() < 0.2 * half.max_element() => 0.0,
-        Shape::Sphere { center, radius } => covered_by_ball(center - point, radius, n),
-        Shape::Block { center, half, .. } => covered_by_ball(center - point, 1.2 * half.element_sum() / 3.0, n),
-        Shape::Drum { base, radius, height } if radius > 2.0 * height => covered_by_disc_above(base - point, radius, n),
-        Shape::Drum { base, radius, height } => covered_by_ball(
+        Shape::Sphere { center, radius } => ball_occlusion(center - point, radius, n),
+        Shape::Block { center, half, .. } => ball_occlusion(center - point, 1.2 * half.element_sum() / 3.0, n),
+        Shape::Drum { base, radius, height } if radius > 2.0 * height => disc_occlusion(base - point, radius, n),
+        Shape::Drum { base, radius, height } => ball_occlusion(
             base + Vec3::Z * (0.5 * height) - point,
             0.5 * (radius + 0.5 * height),
             n,
@@ -52,7 +52,7 @@ fn covered(shape: &Shape, point: Vec3, n: Vec3) -> f32 {
 }
 
 /// A ball entirely above the horizon occludes `cos (r / d)^2` (exact); the fraction falls smoothly to 0 as the ball sets.
-fn covered_by_ball(to_center: Vec3, radius: f32, n: Vec3) -> f32 {
+fn ball_occlusion(to_center: Vec3, radius: f32, n: Vec3) -> f32 {
     let d = to_center.length();
     let size = (radius / d).min(1.0);
     let cosine = n.dot(to_center) / d;
@@ -64,7 +64,7 @@ fn covered_by_ball(to_center: Vec3, radius: f32, n: Vec3) -> f32 {
 }
 
 /// A horizontal disc seen from below: `A cos cos / (pi d^2 + A)`, exact on its axis.
-fn covered_by_disc_above(to_center: Vec3, radius: f32, n: Vec3) -> f32 {
+fn disc_occlusion(to_center: Vec3, radius: f32, n: Vec3) -> f32 {
     if to_center.z <= 0.0 {
         return 0.0;
     }
@@ -113,7 +113,7 @@ mod tests {
             (ball(0.9, 0.5), 0.02),
             (disc(0.7), 0.01),
         ] {
-            let (closed, truth) = (covered(&shape, Vec3::ZERO, Vec3::Z), sampled(shape, Vec3::ZERO));
+            let (closed, truth) = (occlusion(&shape, Vec3::ZERO, Vec3::Z), sampled(shape, Vec3::ZERO));
             assert!((closed - truth).abs() < tolerance, "{shape:?}: {closed} for {truth}");
         }
     }

@@ -28,7 +28,7 @@ pub enum Path {
         aside: f32,
     },
     /// In a plane in front of a target, facing forward along +Y.
-    Before {
+    InFront {
         /// The cameras' approximate target.
         target: Vec3,
         /// Distance of the plane.
@@ -113,7 +113,7 @@ pub fn cameras(rig: &Rig, part: Part, count: u32, width: u32, height: u32, seed:
                     let aimed = target + Vec3::new(aside(), aside(), aside());
                     Pose::look_at(target + distance * away, aimed, Vec3::Z)
                 }
-                Path::Before { target, distance, half } => {
+                Path::InFront { target, distance, half } => {
                     let x = within([-half.x, half.x], 0.618_034);
                     let z = within([-half.y, half.y], 0.754_878);
                     let mut aside = || rng.range(-0.06, 0.06) * distance;

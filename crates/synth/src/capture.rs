@@ -11,18 +11,18 @@ use irradia_scene::{Camera, Dataset, FirstSide, Photo, PointCloud, Rng, RollingS
 use std::sync::Arc;
 
 /// Maximum number of samples per pixel.
-const SAMPLES: u32 = 16;
+const MAX_SAMPLES: u32 = 16;
 /// Number of points over all training views.
-const POINTS: u32 = 6000;
+const POINT_COUNT: u32 = 6000;
 /// Standard deviation of a point's error as a fraction of its distance, as for structure from motion on good photographs.
 const POINT_ERROR: f32 = 0.001;
 
 /// Pixels on each side of a point in the patch in which structure from motion looks for contrast.
-const PATCH: u32 = 2;
+const PATCH_RADIUS: u32 = 2;
 /// Depth beyond which points are not triangulated, world units: cameras a few metres apart see no parallax.
-const FAR: f32 = 100.0;
+const MAX_POINT_DEPTH: f32 = 100.0;
 /// Minimum contrast of such a patch, the largest minus the smallest green in \[0, 1\]: a plain wall has less.
-const CONTRAST: f32 = 0.06;
+const MIN_CONTRAST: f32 = 0.06;
 
 /// Options of a dataset.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -183,7 +183,7 @@ impl Capture {
 
     /// Traces one view, with its depth and normals.
     pub fn trace(&self, shot: &Shot) -> SynthFrame {
-        self.scene.trace(&shot.camera, SAMPLES, shot.seed)
+        self.scene.trace(&shot.camera, MAX_SAMPLES, shot.seed)
     }
 
     /// Simulated structure-from-motion points of the `frame` of a training view; none for other views. Except in the demo scene,
@@ -191,7 +191,7 @@ impl Capture {
     pub fn points(&self, shot: &Shot, frame: &SynthFrame) -> PointCloud {
         let mut points = PointCloud::default();
         if shot.part == Part::Train {
-            let count = (POINTS / self.options.views).max(1);
+            let count = (POINT_COUNT / self.options.views).max(1);
             let mut rng = Rng::new(self.options.seed, 1000 + u64::from(shot.number));
             for _ in 0..count {
                 let (x, y) = (rng.below(frame.color.width), rng.below(frame.color.height));
@@ -205,7 +205,7 @@ impl Capture {
 
     /// Whether structure from motion would find the surface under a pixel.
     fn is_distinct(&self, camera: &Camera, frame: &SynthFrame, x: u32, y: u32) -> bool {
-        let around = |at: u32, side: u32| at.saturating_sub(PATCH)..=(at + PATCH).min(side - 1);
+        let around = |at: u32, side: u32| at.saturating_sub(PATCH_RADIUS)..=(at + PATCH_RADIUS).min(side - 1);
         let (mut low, mut high) = (f32::INFINITY, f32::NEG_INFINITY);
         for row in around(y, frame.color.height) {
             for column in around(x, frame.color.width) {
@@ -215,8 +215,8 @@ impl Capture {
         }
         let ray = pixel_ray(camera, Vec2::new(x as f32 + 0.5, y as f32 + 0.5));
         let hit = ray.and_then(|ray| self.scene.hit(&ray, camera.near));
-        frame.depth.pixel(x, y)[0] < FAR
-            && high - low >= CONTRAST
+        frame.depth.pixel(x, y)[0] < MAX_POINT_DEPTH
+            && high - low >= MIN_CONTRAST
             && hit.is_some_and(|hit| !hit.object.material.texture.is_emissive())
     }
 }

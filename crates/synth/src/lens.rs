@@ -8,7 +8,7 @@ use std::fmt;
 use std::str::FromStr;
 
 /// Field of view of the fisheye across the shorter side, radians: 190 degrees.
-const FISHEYE: f32 = 190.0 / 180.0 * PI;
+const FISHEYE_FOV: f32 = 190.0 / 180.0 * PI;
 
 /// A lens.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -44,7 +44,7 @@ impl SynthLens {
         let (width, height) = (pinhole.width as f32, pinhole.height as f32);
         let (focal, lens) = match self {
             Self::Pinhole => return pinhole,
-            Self::Fisheye => ([width.min(height) / FISHEYE; 2], Lens::fisheye([0.0; 4])),
+            Self::Fisheye => ([width.min(height) / FISHEYE_FOV; 2], Lens::fisheye([0.0; 4])),
             Self::Equirectangular => ([width / TAU, height / PI], Lens::Equirectangular),
         };
         Intrinsics {
@@ -76,7 +76,7 @@ impl FromStr for SynthLens {
 /// Unit direction, in the camera's axes, of the ray through pixel coordinates; `None` outside a fisheye's image circle.
 pub(crate) fn direction(k: &Intrinsics, pixel: Vec2) -> Option<Vec3> {
     let plane = Vec2::new((pixel.x - k.cx) / k.fx, (pixel.y - k.cy) / k.fy);
-    let is_outside = matches!(k.lens, Lens::Fisheye { .. }) && plane.length() > 0.5 * FISHEYE;
+    let is_outside = matches!(k.lens, Lens::Fisheye { .. }) && plane.length() > 0.5 * FISHEYE_FOV;
     if k.lens == Lens::Pinhole {
         return Some(plane.extend(1.0).normalize());
     }

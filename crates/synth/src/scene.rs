@@ -138,11 +138,11 @@ impl SynthScene {
             }
         };
         for cluster in &self.clusters {
-            if passes(ray, cluster.bound, best) {
+            if misses(ray, cluster.bound, best) {
                 continue;
             }
             for (object, bound) in &cluster.objects {
-                if !passes(ray, *bound, best) {
+                if !misses(ray, *bound, best) {
                     meet(object, &mut best);
                 }
             }
@@ -164,7 +164,7 @@ impl SynthScene {
 
     /// Whether anything but the surroundings is hit beyond `near`.
     pub fn is_blocked(&self, ray: &Ray, near: f32) -> bool {
-        let reaches = |bound| !passes(ray, bound, f32::INFINITY);
+        let reaches = |bound| !misses(ray, bound, f32::INFINITY);
         self.clusters
             .iter()
             .filter(|cluster| reaches(cluster.bound))
@@ -177,7 +177,7 @@ impl SynthScene {
 }
 
 /// Whether the ray misses a bounding sphere, starts past it, or reaches it only beyond `far`.
-fn passes(ray: &Ray, (center, radius): (Vec3, f32), far: f32) -> bool {
+fn misses(ray: &Ray, (center, radius): (Vec3, f32), far: f32) -> bool {
     let to_center = center - ray.origin;
     let middle = to_center.dot(ray.direction);
     let square = radius * radius;

@@ -281,7 +281,7 @@ fn rod(ray: &Ray, near: f32, far: f32, a: Vec3, b: Vec3, radius: f32) -> Option<
 
 /// Intersects a torus by sphere tracing (Hart 1996) with its exact distance, between the planes tangent to the tube.
 fn ring(ray: &Ray, near: f32, far: f32, radius: f32, tube: f32) -> Option<(f32, Vec3)> {
-    const HIT: f32 = 2e-5;
+    const HIT_DISTANCE: f32 = 2e-5;
     let (z0, z1) = slab_interval(ray.origin.z, ray.direction.z, -tube, tube)?;
     let (s0, s1) = sphere_interval(ray, Vec3::ZERO, radius + tube)?;
     let (mut t, end) = (z0.max(s0).max(near), z1.min(s1).min(far));
@@ -292,7 +292,7 @@ fn ring(ray: &Ray, near: f32, far: f32, radius: f32, tube: f32) -> Option<(f32, 
         let p = ray.at(t);
         let across = Vec2::new(p.truncate().length() - radius, p.z);
         let distance = across.length() - tube;
-        if distance < HIT {
+        if distance < HIT_DISTANCE {
             let outward = p.truncate().normalize_or_zero() * across.x;
             return Some((t, outward.extend(across.y).normalize_or(Vec3::Z)));
         }

@@ -1,7 +1,7 @@
 //! Distant light: a low sun, a clear sky with thin clouds, three ranges of hills.
 
 use crate::scene::Light;
-use crate::texture::{fbm, noise, smooth};
+use crate::texture::{fbm, noise, smoothstep};
 use glam::{Vec2, Vec3};
 
 /// Unit direction to the afternoon sun, at an elevation of 36 degrees.
@@ -33,10 +33,10 @@ pub fn radiance(direction: Vec3) -> Vec3 {
     if direction.z > 0.02 {
         // Clouds lie on a plane: they grow denser towards the horizon and fade into its haze.
         let above = direction.z + 0.22;
-        let cover = smooth(0.47, 0.82, fbm(direction.truncate() / above * 1.15 + 4.0, 4));
+        let cover = smoothstep(0.47, 0.82, fbm(direction.truncate() / above * 1.15 + 4.0, 4));
         color = color.lerp(
             Vec3::new(1.05, 0.98, 0.92),
-            0.85 * cover * smooth(0.02, 0.22, direction.z),
+            0.85 * cover * smoothstep(0.02, 0.22, direction.z),
         );
     }
     // From far to near: each range is lower, greener and less hazy.
@@ -49,7 +49,7 @@ pub fn radiance(direction: Vec3) -> Vec3 {
     .enumerate()
     {
         let ridge = base + swing * ridge_line(direction, number as f32);
-        let below = smooth(-0.004, 0.004, ridge - direction.z);
+        let below = smoothstep(-0.004, 0.004, ridge - direction.z);
         if below == 0.0 {
             continue;
         }

@@ -78,7 +78,7 @@ impl Texture {
             Texture::Patches { colors: [a, b], size } => {
                 // A slice through the noise that is parallel to no face.
                 let p = Vec2::new(local.x + 0.61 * local.z, local.y - 0.53 * local.z) / size;
-                a.lerp(b, smooth(0.35, 0.65, fbm(p * 2.0, 4)))
+                a.lerp(b, smoothstep(0.35, 0.65, fbm(p * 2.0, 4)))
             }
             Texture::Interior { wall, floor, height } => interior(local, wall, floor, height),
             Texture::Park => park(local.truncate()),
@@ -133,7 +133,7 @@ fn table_top(p: Vec2, radius: f32) -> Vec3 {
         };
     }
     let stave = (angle / TAU * 20.0).floor();
-    let tone = 0.62 + 0.85 * lattice(stave as i32, 7);
+    let tone = 0.62 + 0.85 * lattice_hash(stave as i32, 7);
     // Grain runs outwards: fine across the stave, coarse along it.
     let grain = fbm(Vec2::new(angle * 9.0 + 3.0 * stave, p.length() * 1.4), 3);
     let seam = (angle / TAU * 20.0).rem_euclid(1.0);
@@ -144,13 +144,13 @@ fn table_top(p: Vec2, radius: f32) -> Vec3 {
 fn meadow(p: Vec2) -> Vec3 {
     let r = p.length();
     let patches = fbm(p * 0.5, 2);
-    let grass = Vec3::new(0.085, 0.15, 0.035).lerp(Vec3::new(0.26, 0.24, 0.07), smooth(0.3, 0.75, patches));
+    let grass = Vec3::new(0.085, 0.15, 0.035).lerp(Vec3::new(0.26, 0.24, 0.07), smoothstep(0.3, 0.75, patches));
     let blades = 0.88 + 0.24 * fbm(p * 1.4 + 31.0, 2);
     let row = (r / 0.75).floor();
     let count = (row * 7.0).max(1.0);
     let stone_number = ((p.y.atan2(p.x) / TAU + 0.137 * row) * count).floor().rem_euclid(count);
-    let slab = Vec3::new(0.36, 0.335, 0.30) * (0.7 + 0.5 * lattice(stone_number as i32, row as i32 + 50));
-    slab.lerp(grass * blades, smooth(3.5, 4.3, r + 0.9 * (patches - 0.5)))
+    let slab = Vec3::new(0.36, 0.335, 0.30) * (0.7 + 0.5 * lattice_hash(stone_number as i32, row as i32 + 50));
+    slab.lerp(grass * blades, smoothstep(3.5, 4.3, r + 0.9 * (patches - 0.5)))
 }
 
 fn interior(p: Vec3, wall: Vec3, floor: Vec3, height: f32) -> Vec3 {
@@ -164,7 +164,7 @@ fn interior(p: Vec3, wall: Vec3, floor: Vec3, height: f32) -> Vec3 {
     let row = (p.y / 0.16).floor();
     let along = p.x / 1.3 + 0.37 * row;
     let seam = (p.y / 0.16).rem_euclid(1.0) < 0.05 || along.rem_euclid(1.0) < 0.008;
-    let tone = 0.7 + 0.5 * lattice(along.floor() as i32, row as i32);
+    let tone = 0.7 + 0.5 * lattice_hash(along.floor() as i32, row as i32);
     let grain = 0.7 + 0.6 * fbm(Vec2::new(p.x * 2.0, p.y * 22.0), 3);
     floor * tone * grain * if seam { 0.45 } else { 1.0 }
 }
@@ -172,26 +172,26 @@ fn interior(p: Vec3, wall: Vec3, floor: Vec3, height: f32) -> Vec3 {
 fn park(p: Vec2) -> Vec3 {
     let tufts = fbm(p * 1.1, 5);
     let fields = fbm(p * 0.06 + 3.0, 3);
-    let grass = Vec3::new(0.06, 0.13, 0.03).lerp(Vec3::new(0.27, 0.30, 0.08), smooth(0.3, 0.7, tufts));
+    let grass = Vec3::new(0.06, 0.13, 0.03).lerp(Vec3::new(0.27, 0.30, 0.08), smoothstep(0.3, 0.7, tufts));
     let dry = Vec3::new(0.36, 0.31, 0.13) * (0.6 + 0.8 * tufts);
-    let land = grass.lerp(dry, smooth(0.45, 0.65, fields));
+    let land = grass.lerp(dry, smoothstep(0.45, 0.65, fields));
     let cell = (p / 0.3).floor();
     let off_flower = (p / 0.3 - cell - 0.5).length();
-    let is_flower = off_flower < 0.25 && lattice(cell.x as i32, cell.y as i32 + 900) > 0.93;
+    let is_flower = off_flower < 0.25 && lattice_hash(cell.x as i32, cell.y as i32 + 900) > 0.93;
     let land = if is_flower { Vec3::new(0.75, 0.62, 0.18) } else { land };
     let gravel = Vec3::new(0.44, 0.38, 0.30) * (0.55 + 0.9 * fbm(p * 7.0, 3));
     let off_path = (p.y + 1.2 * (0.45 * p.x).sin()).abs();
-    gravel.lerp(land, smooth(0.55, 0.8, off_path + 0.3 * (tufts - 0.5)))
+    gravel.lerp(land, smoothstep(0.55, 0.8, off_path + 0.3 * (tufts - 0.5)))
 }
 
 /// 0 below `from`, 1 above `to`, smooth in between.
-pub fn smooth(from: f32, to: f32, x: f32) -> f32 {
+pub fn smoothstep(from: f32, to: f32, x: f32) -> f32 {
     let t = ((x - from) / (to - from)).clamp(0.0, 1.0);
     t * t * (3.0 - 2.0 * t)
 }
 
 /// A hash in \[0, 1) of a point of the integer lattice.
-pub fn lattice(x: i32, y: i32) -> f32 {
+pub fn lattice_hash(x: i32, y: i32) -> f32 {
     let mut h = (x as u32).wrapping_mul(0x9e37_79b1) ^ (y as u32).wrapping_mul(0x85eb_ca77);
     h = (h ^ (h >> 15)).wrapping_mul(0x2c1b_3c6d);
     h = (h ^ (h >> 12)).wrapping_mul(0x297a_2d39);
@@ -204,8 +204,8 @@ pub fn noise(p: Vec2) -> f32 {
     let f = p - cell;
     let f = f * f * (3.0 - 2.0 * f);
     let (x, y) = (cell.x as i32, cell.y as i32);
-    let low = lattice(x, y) + (lattice(x + 1, y) - lattice(x, y)) * f.x;
-    let high = lattice(x, y + 1) + (lattice(x + 1, y + 1) - lattice(x, y + 1)) * f.x;
+    let low = lattice_hash(x, y) + (lattice_hash(x + 1, y) - lattice_hash(x, y)) * f.x;
+    let high = lattice_hash(x, y + 1) + (lattice_hash(x + 1, y + 1) - lattice_hash(x, y + 1)) * f.x;
     low + (high - low) * f.y
 }
 

@@ -12,14 +12,14 @@ use rayon::prelude::*;
 use std::f32::consts::TAU;
 
 /// Offset of secondary rays from the surface, world units.
-const LIFT: f32 = 1e-3;
+const RAY_OFFSET: f32 = 1e-3;
 /// Clamp of linear sample values, so that one highlight sample does not whiten a pixel.
-const BRIGHTEST: f32 = 4.0;
+const MAX_RADIANCE: f32 = 4.0;
 /// Samples of a pixel within this distance in sRGB are considered uniform.
-const PLAIN: f32 = 0.05;
+const UNIFORM_TOLERANCE: f32 = 0.05;
 /// Half the width of the pixel's tent-shaped filter, pixels. Its variance, 0.24, is about that of a lens with its sensor,
 /// and of the low-pass filter that splats are rendered with (0.3): splats cannot represent sharper edges.
-const FILTER: f32 = 1.2;
+const FILTER_RADIUS: f32 = 1.2;
 /// Exposure, chosen so that sunlit stone stays below white.
 const EXPOSURE: f32 = 0.46;
 
@@ -86,7 +86,7 @@ impl SynthScene {
         // Adaptive sampling: nine samples that agree suffice for most pixels.
         if side > 3 {
             let (mean, spread) = self.sampled(camera, corner, 3, rng);
-            if spread < PLAIN {
+            if spread < UNIFORM_TOLERANCE {
                 return mean;
             }
         }
@@ -106,20 +106,20 @@ impl SynthScene {
                 let cell = Vec2::new((stratum % side) as f32, (stratum / side) as f32);
                 (cell + Vec2::new(rng.uniform(), rng.uniform())) / side as f32
             };
-            let ray = pixel_ray(camera, corner + 0.5 + within(sample).map(tent) * FILTER);
+            let ray = pixel_ray(camera, corner + 0.5 + within(sample).map(tent) * FILTER_RADIUS);
             let [sun, mirror] = std::array::from_fn(|plane| within(strata[plane][sample as usize]));
             let radiance = match ray.map(|ray| (ray, self.hit(&ray, camera.near))) {
                 Some((ray, Some(hit))) => self.shade(&ray, &hit, sun, mirror),
                 Some((ray, None)) => sky::radiance(ray.direction),
                 None => Vec3::ZERO,
             };
-            let radiance = radiance.min(Vec3::splat(BRIGHTEST));
+            let radiance = radiance.min(Vec3::splat(MAX_RADIANCE));
             sum += radiance;
             (low, high) = (low.min(radiance), high.max(radiance));
         }
         (
-            develop(sum / count as f32),
-            (develop(high) - develop(low)).max_element(),
+            tone_map(sum / count as f32),
+            (tone_map(high) - tone_map(low)).max_element(),
         )
     }
 
@@ -130,8 +130,8 @@ impl SynthScene {
         if material.texture.is_emissive() {
             return color;
         }
-        let start = hit.point + hit.normal * LIFT;
-        let toward_sun = around(light.sun, disc(sun) * light.sun_spread);
+        let start = hit.point + hit.normal * RAY_OFFSET;
+        let toward_sun = tilted(light.sun, disc(sun) * light.sun_spread);
         let facing = hit.normal.dot(toward_sun);
         let lit = facing > 0.0
             && !self.is_blocked(
@@ -139,13 +139,13 @@ impl SynthScene {
                     origin: start,
                     direction: toward_sun,
                 },
-                LIFT,
+                RAY_OFFSET,
             );
         let sunlight = if lit { light.sun_light * facing } else { Vec3::ZERO };
 
         let mut radiance = Vec3::ZERO;
         if !material.metal {
-            radiance += color * (sunlight + ambient::shaded(self, hit));
+            radiance += color * (sunlight + ambient::occluded(self, hit));
         }
         let reflectance = if material.metal {
             color
@@ -163,7 +163,7 @@ impl SynthScene {
             let mut reflected = Vec3::ZERO;
             for turn in 0..rays {
                 let lobe = disc(mirror + Vec2::Y * (turn as f32 / rays as f32)) * material.roughness;
-                let mut direction = around(exact, lobe);
+                let mut direction = tilted(exact, lobe);
                 // A rough lobe may extend below the surface: mirror it back.
                 let below = direction.dot(hit.normal);
                 if below < 0.02 {
@@ -185,7 +185,7 @@ impl SynthScene {
     /// Radiance arriving at a point from a direction: the sky, or a surface with simplified lighting.
     fn incoming(&self, origin: Vec3, direction: Vec3) -> Vec3 {
         let ray = Ray { origin, direction };
-        let Some(hit) = self.hit(&ray, LIFT) else {
+        let Some(hit) = self.hit(&ray, RAY_OFFSET) else {
             return sky::radiance(direction);
         };
         let texture = hit.object.material.texture;
@@ -196,7 +196,7 @@ impl SynthScene {
         let light = &self.light;
         // Without a shadow ray: 0.7 is the assumed fraction of sunlit surfaces.
         let sunlit = 0.7 * hit.normal.dot(light.sun).max(0.0);
-        color * (light.sun_light * sunlit + ambient::open(light, &hit))
+        color * (light.sun_light * sunlit + ambient::unoccluded(light, &hit))
     }
 }
 
@@ -238,13 +238,13 @@ fn tent(u: f32) -> f32 {
 }
 
 /// `axis` tilted by an offset on the plane at distance 1.
-fn around(axis: Vec3, offset: Vec2) -> Vec3 {
+fn tilted(axis: Vec3, offset: Vec2) -> Vec3 {
     let (s, t) = axis.any_orthonormal_pair();
     (axis + s * offset.x + t * offset.y).normalize()
 }
 
 /// Linear radiance to sRGB: Narkowicz's fit (2015) of the ACES film curve, then sRGB.
-fn develop(linear: Vec3) -> Vec3 {
+fn tone_map(linear: Vec3) -> Vec3 {
     let x = linear * EXPOSURE;
     let film = (x * (2.51 * x + 0.03)) / (x * (2.43 * x + 0.59) + 0.14);
     Vec3::from_array(film.to_array().map(|v| srgb_from_linear(v.clamp(0.0, 1.0))))

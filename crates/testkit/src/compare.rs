@@ -11,11 +11,11 @@ pub struct Difference {
     pub want: f64,
 }
 
-/// The largest `|got - want|` over the indices for which `counts` is true.
+/// The largest `|got - want|` over the indices for which `is_included` is true.
 ///
 /// # Panics
 /// When lengths differ.
-pub fn max_abs_difference(got: &[f64], want: &[f64], counts: impl Fn(usize) -> bool) -> Difference {
+pub fn max_abs_difference(got: &[f64], want: &[f64], is_included: impl Fn(usize) -> bool) -> Difference {
     assert_eq!(got.len(), want.len(), "lengths match");
     let mut worst = Difference {
         worst: 0.0,
@@ -23,7 +23,7 @@ pub fn max_abs_difference(got: &[f64], want: &[f64], counts: impl Fn(usize) -> b
         got: 0.0,
         want: 0.0,
     };
-    for (index, (got, want)) in got.iter().zip(want).enumerate().filter(|(i, _)| counts(*i)) {
+    for (index, (got, want)) in got.iter().zip(want).enumerate().filter(|(i, _)| is_included(*i)) {
         let difference = (got - want).abs();
         if difference > worst.worst || difference.is_nan() {
             worst = Difference {
@@ -50,10 +50,10 @@ pub fn max_abs_difference(got: &[f64], want: &[f64], counts: impl Fn(usize) -> b
 /// When lengths differ.
 pub fn relative_difference(got: &[f64], want: &[f64], floor: f64) -> Difference {
     // Positive even without a floor, so that two zeros differ by zero.
-    let least = (floor * want.iter().fold(0.0f64, |m, v| m.max(v.abs()))).max(f64::MIN_POSITIVE);
+    let min_scale = (floor * want.iter().fold(0.0f64, |m, v| m.max(v.abs()))).max(f64::MIN_POSITIVE);
     let scaled = |values: &[f64]| -> Vec<f64> {
         let pairs = values.iter().zip(want);
-        pairs.map(|(value, want)| value / (want.abs() + least)).collect()
+        pairs.map(|(value, want)| value / (want.abs() + min_scale)).collect()
     };
     assert_eq!(got.len(), want.len(), "lengths match");
     let difference = max_abs_difference(&scaled(got), &scaled(want), |_| true);

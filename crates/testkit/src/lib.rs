@@ -2,7 +2,7 @@
 #![forbid(unsafe_code)]
 
 mod compare;
-pub mod differences;
+pub mod finite_differences;
 mod golden;
 mod gpu;
 pub mod shared;

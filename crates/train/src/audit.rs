@@ -12,7 +12,7 @@ const MISFITS_AT: f64 = 0.2;
 /// transients; the later searches find the borders of what the first one found.
 const TRANSIENTS_AT: [f64; 3] = [0.3, 0.45, 0.6];
 /// Minimum number of a run's steps per training view for any decision: with fewer, the renders would cost more than a twentieth of the run.
-const STEPS_PER_VIEW: usize = 8;
+const MIN_STEPS_PER_VIEW: usize = 8;
 
 impl Trainer {
     /// Does what is due after a step that began at `before`, in steps of the recipe: leaves out misfits, hides transients.
@@ -20,7 +20,7 @@ impl Trainer {
         let (total, now) = (self.recipe.total_steps() as f64, self.clock.time);
         let passes = |at: f64| before < at * total && now >= at * total;
         let mut events = Vec::new();
-        if self.total_steps() < (STEPS_PER_VIEW * self.trained.len()) as u64 {
+        if self.total_steps() < (MIN_STEPS_PER_VIEW * self.trained.len()) as u64 {
             return Ok(events);
         }
         if self.recipe.drop_misfits && passes(MISFITS_AT) {
@@ -42,8 +42,8 @@ impl Trainer {
     fn training_errors(&mut self) -> Result<Vec<(usize, [f64; 2])>, TrainError> {
         let plan = plan(&self.recipe, &self.clock);
         let mut errors = Vec::with_capacity(self.trained.len());
-        self.show_training_views(self.trained.len(), &plan, false, |trainer, view, photo| {
-            errors.push((view, trainer.errors_of_frame(photo)));
+        self.render_training_views(self.trained.len(), &plan, false, |trainer, view, photo| {
+            errors.push((view, trainer.frame_errors(photo)));
         })?;
         Ok(errors)
     }
@@ -52,7 +52,7 @@ impl Trainer {
     fn find_transients(&mut self) -> Result<(), TrainError> {
         let plan = plan(&self.recipe, &self.clock);
         let mut differences = Vec::with_capacity(self.trained.len());
-        self.show_training_views(self.trained.len(), &plan, true, |trainer, view, photo| {
+        self.render_training_views(self.trained.len(), &plan, true, |trainer, view, photo| {
             let frame = FramePlanes {
                 color: trainer.sockets.frame_color(&trainer.engine),
                 ..trainer.engine.frame()

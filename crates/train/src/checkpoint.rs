@@ -31,14 +31,14 @@ const FORMAT: &str = "irradia-checkpoint-5";
 /// The previous format, which is still read ([`carried`]).
 const FORMAT_4: &str = "irradia-checkpoint-4";
 /// Prefix of the names of a field's tensors.
-const FIELD: &str = "field.";
+const FIELD_PREFIX: &str = "field.";
 /// The time breakdown; absent from earlier checkpoints.
-const TIMES: &str = "times";
+const TIMES_TENSOR: &str = "times";
 /// Views to train on; absent if no misfits were left out.
-const TRAINED: &str = "trained_views";
+const TRAINED_TENSOR: &str = "trained_views";
 /// View and block of each block that is hidden as transient.
-const HIDDEN: &str = "hidden_blocks";
-const OWNERS: [&str; 3] = ["splats", "first_moments", "second_moments"];
+const HIDDEN_TENSOR: &str = "hidden_blocks";
+const COLUMN_OWNERS: [&str; 3] = ["splats", "first_moments", "second_moments"];
 
 /// A training run between two steps, as it is written: the splats' columns are borrowed, or copied to be written while training
 /// continues.
@@ -58,20 +58,20 @@ impl<'a> Checkpoint<'a> {
             others.extend(owned.into_iter().map(|tensor| tensor.prefixed(prefix)));
         };
         if let Some(field) = &trainer.field {
-            keep(FIELD, field_file::state_tensors(field.state()));
+            keep(FIELD_PREFIX, field_file::state_tensors(field.state()));
         }
         for occupant in trainer.sockets.occupants() {
             keep(&format!("{}.", occupant.name()), occupant.tensors());
         }
         let clock = &trainer.clock;
-        let whole = [
+        let integers = [
             clock.step,
             clock.stage as u64,
             clock.stage_step,
             u64::from(clock.was_reset),
             clock.monitor.steps,
         ];
-        let real = [
+        let reals = [
             clock.time,
             clock.stage_time,
             clock.progress,
@@ -84,18 +84,18 @@ impl<'a> Checkpoint<'a> {
             trainer.seconds,
             trainer.cpu_seconds,
         ];
-        others.push(NamedTensor::whole("clock.whole", &whole));
-        others.push(NamedTensor::double("clock.real", &real));
-        others.push(NamedTensor::double(TIMES, &trainer.times.to_array()));
+        others.push(NamedTensor::u64s("clock.whole", &integers));
+        others.push(NamedTensor::f64s("clock.real", &reals));
+        others.push(NamedTensor::f64s(TIMES_TENSOR, &trainer.times.to_array()));
         if trainer.trained.len() < trainer.dataset.train.len() {
             let trained: Vec<u64> = trainer.trained.iter().map(|view| *view as u64).collect();
-            others.push(NamedTensor::whole(TRAINED, &trained));
+            others.push(NamedTensor::u64s(TRAINED_TENSOR, &trained));
         }
         if trainer.hidden.views() > 0 {
-            others.push(NamedTensor::whole(HIDDEN, &trainer.hidden.to_pairs()));
+            others.push(NamedTensor::u64s(HIDDEN_TENSOR, &trainer.hidden.to_pairs()));
         }
         let carried = carried::named(&clock.carried);
-        others.extend(carried.map(|(name, value)| NamedTensor::double(name, &[value])));
+        others.extend(carried.map(|(name, value)| NamedTensor::f64s(name, &[value])));
         Self {
             step: clock.step,
             state: Cow::Borrowed(trainer.engine.state()),
@@ -137,7 +137,10 @@ impl<'a> Checkpoint<'a> {
     pub fn write(&self, out: &mut (impl Write + ?Sized)) -> io::Result<()> {
         let state = &*self.state;
         let mut tensors: Vec<Tensor> = Vec::new();
-        for (owner, splats) in OWNERS.iter().zip([&state.splats, &state.moments[0], &state.moments[1]]) {
+        for (owner, splats) in COLUMN_OWNERS
+            .iter()
+            .zip([&state.splats, &state.moments[0], &state.moments[1]])
+        {
             let columns = COLUMN_NAMES.iter().zip(splats.columns());
             tensors.extend(columns.map(|(name, planes)| Tensor::of_planes(format!("{owner}.{name}"), planes)));
         }
@@ -183,7 +186,7 @@ fn write_tensors(
             Content::Bytes(bytes) => out.write_all(bytes)?,
             Content::Planes(planes) => {
                 for c in 0..planes.count() {
-                    for piece in planes.plane(c)[..planes.len()].chunks(PIECE) {
+                    for piece in planes.plane(c)[..planes.len()].chunks(VALUES_PER_WRITE) {
                         encoded.resize(4 * piece.len(), 0);
                         for (to, value) in encoded.as_chunks_mut().0.iter_mut().zip(piece) {
                             *to = value.to_le_bytes();
@@ -209,14 +212,14 @@ fn planes_of(file: &SafeTensors, name: &str) -> Result<Planes, String> {
     let mut planes = Planes::zeros(count, len);
     for c in 0..count {
         let from = view.data()[4 * c * len..4 * (c + 1) * len].as_chunks().0;
-        let to = planes.plane_mut(c)[..len].par_iter_mut().with_min_len(PIECE);
+        let to = planes.plane_mut(c)[..len].par_iter_mut().with_min_len(VALUES_PER_WRITE);
         to.zip(from).for_each(|(to, from)| *to = f32::from_le_bytes(*from));
     }
     Ok(planes)
 }
 
 /// Number of values that are encoded at a time, so that they are still in the cache when they are written.
-const PIECE: usize = 1 << 16;
+const VALUES_PER_WRITE: usize = 1 << 16;
 
 /// A tensor of the file.
 struct Tensor<'a> {
@@ -306,8 +309,8 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
         })
     };
     let state = SplatState {
-        splats: splats(OWNERS[0])?,
-        moments: [splats(OWNERS[1])?, splats(OWNERS[2])?],
+        splats: splats(COLUMN_OWNERS[0])?,
+        moments: [splats(COLUMN_OWNERS[1])?, splats(COLUMN_OWNERS[2])?],
         statistics: planes("statistics")?,
         filter: planes("filter")?,
     };
@@ -322,8 +325,8 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
     {
         return Err(wrong("its columns have different lengths".into()));
     }
-    let whole = words(array("clock.whole", Dtype::U64)?.1);
-    let real = reals(array("clock.real", Dtype::F64)?.1);
+    let integers = u64s(array("clock.whole", Dtype::U64)?.1);
+    let reals = f64s(array("clock.real", Dtype::F64)?.1);
     let (
         [step, stage, stage_step, was_reset, watched],
         [
@@ -340,26 +343,28 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
             cpu_seconds,
             unnamed @ ..,
         ],
-    ) = (&whole[..], &real[..])
+    ) = (&integers[..], &reals[..])
     else {
         return Err(wrong("its clock has the wrong length".into()));
     };
     let carried = carried::read(&file, unnamed)?;
-    let mut trainer = Trainer::unfilled(dataset, recipe, TrainOptions { seed, ..options }, state.len())?;
-    trainer.splats_at_first = first_count(&trainer.dataset, &trainer.recipe).min(state.len());
+    let mut trainer = Trainer::with_empty_state(dataset, recipe, TrainOptions { seed, ..options }, state.len())?;
+    trainer.initial_splats = first_count(&trainer.dataset, &trainer.recipe).min(state.len());
+    // A run begins with more bands than its recipe has at that step only if its first splats had them.
+    trainer.first_sh_degree = state.splats.used_sh_degree();
     *trainer.engine.state_mut() = state;
     let tensors = |prefix| TensorSource::new(&file, prefix);
-    if tensors(FIELD).whole("whole").is_some() {
+    if tensors(FIELD_PREFIX).u64s("whole").is_some() {
         if trainer.recipe.field.is_none() {
             return Err(wrong("its field and its recipe do not agree".into()));
         }
         let fresh = trainer.first_field()?.field;
-        let state = field_file::state_from(fresh.config, fresh.space, tensors(FIELD));
-        trainer.set_field(state.map_err(|why| wrong(format!("{FIELD}{why}")))?)?;
+        let state = field_file::state_from(fresh.config, fresh.space, tensors(FIELD_PREFIX));
+        trainer.set_field(state.map_err(|why| wrong(format!("{FIELD_PREFIX}{why}")))?)?;
     }
     trainer.sockets = trainer.first_sockets()?;
     // The run may have decided to learn exposures.
-    if trainer.recipe.exposure == Choice::Auto && tensors("exposure.").whole("steps").is_some() {
+    if trainer.recipe.exposure == Choice::Auto && tensors("exposure.").u64s("steps").is_some() {
         trainer.sockets.exposure = Some(Exposure::new(trainer.dataset.views.len(), &trainer.dataset.train));
     }
     for occupant in trainer.sockets.occupants_mut() {
@@ -368,22 +373,22 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
         restored.map_err(|why| wrong(format!("{prefix}{why}")))?;
     }
     // The run may have left out photographs.
-    if let Some(trained) = tensors("").whole(TRAINED) {
+    if let Some(trained) = tensors("").u64s(TRAINED_TENSOR) {
         let known = |view: &u64| trainer.dataset.train.contains(&(*view as usize));
         if trained.is_empty() || !trained.iter().all(known) {
-            return Err(wrong(format!("{TRAINED} and the dataset do not agree")));
+            return Err(wrong(format!("{TRAINED_TENSOR} and the dataset do not agree")));
         }
         trainer.trained = trained.iter().map(|view| *view as usize).collect();
     }
-    if let Some(pairs) = tensors("").whole(HIDDEN) {
+    if let Some(pairs) = tensors("").u64s(HIDDEN_TENSOR) {
         let camera = |view: usize| trainer.dataset.views.get(view).map(|view| &view.camera);
         trainer.hidden = Hidden::from_pairs(&pairs, camera)
-            .ok_or_else(|| wrong(format!("{HIDDEN} and the dataset do not agree")))?;
+            .ok_or_else(|| wrong(format!("{HIDDEN_TENSOR} and the dataset do not agree")))?;
     }
     (trainer.pace, trainer.seconds, trainer.cpu_seconds) = (*pace, *seconds, *cpu_seconds);
-    if let Ok((_, bytes)) = array(TIMES, Dtype::F64) {
-        let times = reals(bytes).try_into();
-        trainer.times = Times::from_array(times.map_err(|_| wrong(format!("{TIMES} has the wrong length")))?);
+    if let Ok((_, bytes)) = array(TIMES_TENSOR, Dtype::F64) {
+        let times = f64s(bytes).try_into();
+        trainer.times = Times::from_array(times.map_err(|_| wrong(format!("{TIMES_TENSOR} has the wrong length")))?);
     }
     trainer.clock = Clock {
         step: *step,
@@ -408,11 +413,11 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
 }
 
 /// Little-endian integers.
-fn words(bytes: &[u8]) -> Vec<u64> {
+fn u64s(bytes: &[u8]) -> Vec<u64> {
     bytes.as_chunks().0.iter().map(|b| u64::from_le_bytes(*b)).collect()
 }
 
 /// Little-endian double-precision numbers.
-fn reals(bytes: &[u8]) -> Vec<f64> {
+fn f64s(bytes: &[u8]) -> Vec<f64> {
     bytes.as_chunks().0.iter().map(|b| f64::from_le_bytes(*b)).collect()
 }

@@ -26,46 +26,46 @@ use glam::Vec3;
 use irradia_scene::{Photo, View};
 
 /// Maximum number of training photographs that are examined, evenly spaced.
-const SAMPLES: usize = 24;
+const MAX_SAMPLES: usize = 24;
 /// Longer side at which they are read, pixels.
-const SIDE: u32 = 96;
+const SAMPLE_SIDE: u32 = 96;
 /// Minimum fraction of the photographs that are cut-outs, or have a sky.
-const MOST: f64 = 0.75;
+const MIN_PHOTO_FRACTION: f64 = 0.75;
 /// Maximum fraction of a cut-out's pixels that its mask keeps, and minimum fraction of its outermost pixels that the mask leaves out.
-const KEPT: f64 = 0.5;
-const BORDER_LEFT_OUT: f64 = 0.6;
+const MAX_KEPT_FRACTION: f64 = 0.5;
+const MIN_BORDER_FRACTION: f64 = 0.6;
 /// Minimum fraction of its bounding box that a mask keeps if it keeps an upright rectangle, allowing for undistortion.
-const RECTANGLE: f64 = 0.95;
+const MIN_RECTANGLE_FILL: f64 = 0.95;
 /// Minimum fraction of a photograph that a sky covers.
-const SKY_SHARE: f64 = 0.1;
+const MIN_SKY_FRACTION: f64 = 0.1;
 /// Minimum cosine of the angle between a photograph's up direction and the mean of all for its upper edge to show a sky: a panorama's face
 /// that looks down has the floor there.
-const UPRIGHT: f32 = 0.5;
+const MIN_UP_COSINE: f32 = 0.5;
 /// Maximum difference of a channel between adjacent pixels of a sky, out of 255.
-const SKY_STEP: u8 = 8;
+const MAX_SKY_STEP: u8 = 8;
 /// Minimum standard deviation between photographs, both of their skies' colours and of these colours relative to their brightness, at which
 /// each photograph needs its own sky. Measured: a statue by 135 cameras 0.19 and 0.19; eleven captures of one camera, with walls and
 /// ceilings for skies, at most 0.11 and 0.08; fox with random exposures and white balances 0.19 and 0.10.
-const SKY_SPREAD: f64 = 0.14;
+const MIN_SKY_SPREAD: f64 = 0.14;
 
 /// Mean number of pixels of the training photographs above which they are large, and their minimum number: a few photographs are each seen
 /// often in any case, and their quarters mislead. Held-out PSNR at 1600x758, 120 s of one thread: an object in 17 photographs 40.27 without
 /// and 36.78 dB with `large`; captures of 62 to 148 photographs gain 0.3 to 0.7 dB.
-const LARGE: f64 = 0.8e6;
-const MANY: usize = 50;
+const MIN_LARGE_PIXELS: f64 = 0.8e6;
+const MIN_LARGE_PHOTOS: usize = 50;
 
 /// Minimum angle between adjacent photographs, degrees, at which they are sparse. Held-out PSNR of `fast` at 240 pixels with the usual
 /// 3,000 steps and with 1,200 and `depth_weight` 0.5: fox, 12 photographs 13 degrees apart, 28.2 and 28.7; 6, 29 degrees apart, 24.1 and
 /// 24.9; cup, 12, 27 degrees apart, 26.4 and 26.6. With 750 steps: fox, 24 photographs 7 degrees apart, 32.7 and 31.6; lund_door, 6
 /// photographs 5 degrees apart, 35.3 and 34.3; fern, 6 photographs 2 degrees apart, 27.7 and 26.7. With 90 steps per photograph, 480
 /// pixels: a book on a table, 6 photographs 9.4 degrees apart, 18.4 and 21.3; toys, 7 photographs 8.1 degrees apart, 24.0 and 24.2.
-pub(crate) const SPARSE: f64 = 8.0;
+pub(crate) const SPARSE_ANGLE_DEGREES: f64 = 8.0;
 /// For closer photographs, the limit on the steps of each is inversely proportional to the angle between them, and never below the usual
 /// number of steps. `fast` at 320 pixels with 1,000, 2,000, 4,000 and 8,000 steps: a bust, 22 photographs 6.5 degrees apart, 25.77, 25.46,
 /// 24.35, 23.83; a locomotive, 18, 4.5 degrees, 23.86, 24.23, 24.10, 23.45; a toy, 17, 3.3 degrees, 30.27, 31.42, 31.16, 30.93; fern, 17,
 /// 2.1 degrees, 30.20, 30.65, 30.52, 30.23; but a drone's film, 17, 0.56 degrees, 26.38, 26.62, 26.74, 26.79; a corridor, 16, 0.06 degrees,
 /// 37.41, 38.44 with the last two. At this angle, degrees, the limit stops growing: it is too high to matter.
-const CLOSEST: f64 = 0.01;
+const MIN_SPACING_DEGREES: f64 = 0.01;
 
 /// Whether the mask of `photo` leaves out all but an object. A mask that keeps an upright rectangle does not count: that is an image
 /// between bars.
@@ -83,7 +83,9 @@ fn is_cut_out(photo: &Photo) -> bool {
         return false;
     }
     let (kept, rectangle) = (f64::from(kept), ((right - left) * (bottom - top)) as f64);
-    kept < RECTANGLE * rectangle && kept <= KEPT * mask.len() as f64 && photo.border_left_out() >= BORDER_LEFT_OUT
+    kept < MIN_RECTANGLE_FILL * rectangle
+        && kept <= MAX_KEPT_FRACTION * mask.len() as f64
+        && photo.border_left_out() >= MIN_BORDER_FRACTION
 }
 
 /// The mean colour, in \[0, 1\], of the smooth region at the upper edge of `photo`, if it is large enough for a sky.
@@ -108,19 +110,19 @@ fn sky_color(photo: &Photo) -> Option<[f64; 3]> {
         ];
         for next in adjacent.into_iter().flatten() {
             let mut steps = color(at).iter().zip(color(next)).map(|(a, b)| a.abs_diff(*b));
-            if !seen[next] && counts(next) && steps.all(|step| step <= SKY_STEP) {
+            if !seen[next] && counts(next) && steps.all(|step| step <= MAX_SKY_STEP) {
                 seen[next] = true;
                 edge.push(next);
             }
         }
     }
-    let covers = count as f64 >= SKY_SHARE * (width * height) as f64;
+    let covers = count as f64 >= MIN_SKY_FRACTION * (width * height) as f64;
     covers.then(|| sum.map(|sum| sum as f64 / (255 * count) as f64))
 }
 
 /// Whether the `colors` of skies found in `photographs` photographs are too different for one scene.
 fn skies_differ(colors: &[[f64; 3]], photographs: usize) -> bool {
-    if colors.len() < 2 || (colors.len() as f64) < MOST * photographs as f64 {
+    if colors.len() < 2 || (colors.len() as f64) < MIN_PHOTO_FRACTION * photographs as f64 {
         return false;
     }
     // The largest of the channels' standard deviations.
@@ -137,18 +139,18 @@ fn skies_differ(colors: &[[f64; 3]], photographs: usize) -> bool {
         let brightness = color.iter().sum::<f64>() / 3.0;
         color.map(|v| v / brightness.max(0.05))
     };
-    spread(&|color| *color) >= SKY_SPREAD && spread(&balance) >= SKY_SPREAD
+    spread(&|color| *color) >= MIN_SKY_SPREAD && spread(&balance) >= MIN_SKY_SPREAD
 }
 
 impl Trainer {
     /// Adds one line to what the run reports about its data at the start: [`Event::Decided`](crate::event::Event::Decided).
-    pub fn tell(&mut self, decision: String) {
+    pub fn add_decision(&mut self, decision: String) {
         self.decisions.push(decision);
     }
 
     /// Puts the recipe's parameters into effect for the conditions that the data meet. They are changed in the recipe, so that a resumed
     /// run has the same values.
-    pub(crate) fn settle_conditions(&mut self) -> Result<(), TrainError> {
+    pub(crate) fn apply_data_conditions(&mut self) -> Result<(), TrainError> {
         let [large, skies, known_space, cut_out] = [
             std::mem::take(&mut self.recipe.large),
             std::mem::take(&mut self.recipe.skies),
@@ -158,13 +160,13 @@ impl Trainer {
         let (mut cut_outs, mut photographs) = (0usize, 0usize);
         let (mut sky_colors, mut upright) = (Vec::new(), 0usize);
         if !(skies.is_empty() && cut_out.is_empty()) {
-            let every = self.dataset.train.len().div_ceil(SAMPLES);
+            let every = self.dataset.train.len().div_ceil(MAX_SAMPLES);
             let up = |view: &View| view.camera.pose.rotation * Vec3::NEG_Y;
             let train = self.dataset.train.iter().map(|view| &self.dataset.views[*view]);
             let mean_up = train.clone().map(up).sum::<Vec3>().normalize_or_zero();
             for view in train.step_by(every) {
                 let k = &view.camera.intrinsics;
-                let small = k.scaled((SIDE as f32 / k.width.max(k.height) as f32).min(1.0));
+                let small = k.scaled((SAMPLE_SIDE as f32 / k.width.max(k.height) as f32).min(1.0));
                 // A photograph that cannot be read makes the first step fail, from which the run can be resumed.
                 let Ok(photo) = view.photo.load_at(small.width, small.height) else {
                     continue;
@@ -172,13 +174,13 @@ impl Trainer {
                 photographs += 1;
                 // The mask of a wide lens is that of its image circle.
                 cut_outs += usize::from(!k.lens.is_wide() && is_cut_out(&photo));
-                if up(view).dot(mean_up) >= UPRIGHT {
+                if up(view).dot(mean_up) >= MIN_UP_COSINE {
                     upright += 1;
                     sky_colors.extend(sky_color(&photo).filter(|_| photo.channels == 3));
                 }
             }
         }
-        let are_cut_out = photographs > 0 && cut_outs as f64 >= MOST * photographs as f64;
+        let are_cut_out = photographs > 0 && cut_outs as f64 >= MIN_PHOTO_FRACTION * photographs as f64;
         let known = if has_points(&self.dataset) {
             Some("points show the surfaces")
         } else if are_cut_out {
@@ -189,22 +191,22 @@ impl Trainer {
             None
         };
         if !are_cut_out && skies_differ(&sky_colors, upright) {
-            self.put_into_effect("the sky differs from photograph to photograph", "skies", skies);
+            self.apply_params("the sky differs from photograph to photograph", "skies", skies);
         }
         if let Some(why) = known {
-            self.put_into_effect(why, "known_space", known_space);
+            self.apply_params(why, "known_space", known_space);
         }
         if are_cut_out {
-            self.put_into_effect("masks leave out all but an object", "cut_out", cut_out);
+            self.apply_params("masks leave out all but an object", "cut_out", cut_out);
         }
         // With wide lenses even large photographs have few pixels per angle.
-        if self.pixels > LARGE && self.dataset.train.len() >= MANY && !self.has_wide_lenses() {
-            self.put_into_effect("photographs are large", "large", large);
+        if self.pixels > MIN_LARGE_PIXELS && self.dataset.train.len() >= MIN_LARGE_PHOTOS && !self.has_wide_lenses() {
+            self.apply_params("photographs are large", "large", large);
         }
-        self.settle_lenses();
-        self.tell_shutters();
-        self.settle_spacing();
-        self.settle_maps();
+        self.adapt_to_wide_lenses();
+        self.report_shutters();
+        self.limit_sparse_steps();
+        self.prepare_maps();
         // The clock carries the values of parameters from stage to stage, and must start with the new ones.
         self.clock = Clock::new(&self.recipe);
         Ok(())
@@ -212,7 +214,7 @@ impl Trainer {
 
     /// Reads the depth and normal maps if the recipe gives them a weight. If none can be used, the weight is removed: frames then need no
     /// depth for them.
-    fn settle_maps(&mut self) {
+    fn prepare_maps(&mut self) {
         if DepthMaps::are_given(&self.dataset) && self.recipe.uses(Param::DepthMapWeight) {
             let maps = DepthMaps::read(&self.dataset);
             self.decisions.push(maps.summary.clone());
@@ -231,7 +233,7 @@ impl Trainer {
         }
     }
 
-    fn settle_lenses(&mut self) {
+    fn adapt_to_wide_lenses(&mut self) {
         if self.has_wide_lenses() && !self.recipe.render.antialias {
             self.recipe.render.antialias = true;
             self.decisions
@@ -240,7 +242,7 @@ impl Trainer {
     }
 
     /// Reports how fast cameras move, so that velocities in a wrong unit are noticed.
-    fn tell_shutters(&mut self) {
+    fn report_shutters(&mut self) {
         let (train, views) = (&self.dataset.train, &self.dataset.views);
         let shutters = train.iter().filter_map(|view| views[*view].camera.shutter);
         let turns: Vec<f64> = shutters.map(|shutter| f64::from(shutter.rotation.length())).collect();
@@ -262,26 +264,26 @@ impl Trainer {
 
     /// Maximum number of steps per training photograph in a run without a given number of steps, 0 for no limit: the recipe's
     /// `sparse_visits`, and more for closer photographs.
-    pub(crate) fn most_visits(&self) -> u64 {
+    pub(crate) fn max_visits(&self) -> u64 {
         let (visits, spacing) = (self.recipe.sparse_visits, self.spacing.to_degrees());
-        if visits == 0 || spacing >= SPARSE {
+        if visits == 0 || spacing >= SPARSE_ANGLE_DEGREES {
             return visits;
         }
         let own = self
             .recipe
             .total_steps()
             .div_ceil(self.dataset.train.len().max(1) as u64);
-        own.max((visits as f64 * SPARSE / spacing.max(CLOSEST)) as u64)
+        own.max((visits as f64 * SPARSE_ANGLE_DEGREES / spacing.max(MIN_SPACING_DEGREES)) as u64)
     }
 
-    fn settle_spacing(&mut self) {
+    fn limit_sparse_steps(&mut self) {
         let spacing = self.spacing.to_degrees();
-        if self.recipe.sparse_visits == 0 || spacing < SPARSE {
+        if self.recipe.sparse_visits == 0 || spacing < SPARSE_ANGLE_DEGREES {
             return;
         }
-        let (total, least) = (self.total_steps(), self.least_pace());
-        if self.options.steps.is_none() && least > self.pace {
-            self.pace = least;
+        let (total, min_pace) = (self.total_steps(), self.min_pace());
+        if self.options.steps.is_none() && min_pace > self.pace {
+            self.pace = min_pace;
             self.decisions.push(format!(
                 "adjacent photographs are {spacing:.0} degrees apart: at most {} steps instead of {total}, since more would only fit single photographs (--steps sets another number)",
                 self.total_steps()
@@ -289,7 +291,7 @@ impl Trainer {
         }
     }
 
-    fn put_into_effect(&mut self, why: &str, table: &str, params: Params) {
+    fn apply_params(&mut self, why: &str, table: &str, params: Params) {
         if params.is_empty() {
             return;
         }
@@ -349,9 +351,9 @@ pub(crate) mod tests {
             let given = recipe.known_space.get(&Param::OpacityReg).cloned();
             let trainer = Trainer::new(dataset(channels, points), recipe, TrainOptions::default()).unwrap();
             assert!(trainer.recipe.known_space.is_empty(), "settled");
-            let told = trainer.decisions.iter().any(|line| line.contains("opacity_reg"));
+            let reported = trainer.decisions.iter().any(|line| line.contains("opacity_reg"));
             let value = trainer.recipe.params[&Param::OpacityReg].clone();
-            assert_eq!(told, value != usual);
+            assert_eq!(reported, value != usual);
             (value, usual, given)
         };
         for (channels, points) in [(3, true), (4, false), (4, true)] {
@@ -382,10 +384,10 @@ pub(crate) mod tests {
             let recipe = Recipe::parse("fast", Recipe::built_in("fast").unwrap(), set).unwrap();
             let large = recipe.large.get(&Param::ImageScale).cloned();
             let trainer = Trainer::new(Arc::new(data), recipe, TrainOptions::default()).unwrap();
-            let is_told = trainer.decisions.iter().any(|line| line.contains("[large]"));
+            let reported = trainer.decisions.iter().any(|line| line.contains("[large]"));
             let scales = trainer.recipe.params[&Param::ImageScale].clone();
-            assert_eq!(is_told, Some(&scales) == large.as_ref());
-            (is_told, scales)
+            assert_eq!(reported, Some(&scales) == large.as_ref());
+            (reported, scales)
         };
         assert!(scales(50, [1200, 900], Lens::Pinhole, &[]).0);
         assert!(!scales(50, [800, 800], Lens::Pinhole, &[]).0);
@@ -411,22 +413,22 @@ pub(crate) mod tests {
             data.views[0].depth_map = map;
             let recipe = Recipe::parse("fast", Recipe::built_in("fast").unwrap(), &[]).unwrap();
             let trainer = Trainer::new(Arc::new(data), recipe, TrainOptions::default()).unwrap();
-            let told = trainer
+            let reported = trainer
                 .decisions
                 .iter()
                 .find(|line| line.contains("maps of depth"))
                 .cloned();
-            (told, trainer.recipe.params.contains_key(&Param::DepthMapWeight))
+            (reported, trainer.recipe.params.contains_key(&Param::DepthMapWeight))
         };
         assert_eq!(settled(None), (None, false));
-        let (told, weighed) = settled(Some(Arc::new(Broken)));
-        assert!(told.unwrap().starts_with("0 of 1") && !weighed);
-        let (told, weighed) = settled(Some(Arc::new(DepthGrid {
+        let (reported, weighed) = settled(Some(Arc::new(Broken)));
+        assert!(reported.unwrap().starts_with("0 of 1") && !weighed);
+        let (reported, weighed) = settled(Some(Arc::new(DepthGrid {
             columns: 2,
             rows: 1,
             values: vec![1.0, 2.0],
         })));
-        assert!(told.unwrap().starts_with("1 of 1") && weighed);
+        assert!(reported.unwrap().starts_with("1 of 1") && weighed);
     }
 
     #[test]
@@ -468,9 +470,9 @@ pub(crate) mod tests {
         // apart.
         let close = trainer(60, None);
         assert_eq!(close.total_steps(), 3000);
-        assert!((3000.0 / close.least_pace() / (60.0 * 90.0 * 8.0 / 6.0) - 1.0).abs() < 0.02);
+        assert!((3000.0 / close.min_pace() / (60.0 * 90.0 * 8.0 / 6.0) - 1.0).abs() < 0.02);
         let few = trainer(48, None);
-        assert!((3000.0 / few.least_pace() / (48.0 * 90.0 * 8.0 / 7.5) - 1.0).abs() < 0.02);
+        assert!((3000.0 / few.min_pace() / (48.0 * 90.0 * 8.0 / 7.5) - 1.0).abs() < 0.02);
     }
 
     #[test]
@@ -480,9 +482,9 @@ pub(crate) mod tests {
             data.views[0].camera.intrinsics.lens = lens;
             let recipe = Recipe::parse("fast", Recipe::built_in("fast").unwrap(), &[]).unwrap();
             let trainer = Trainer::new(Arc::new(data), recipe, TrainOptions::default()).unwrap();
-            let told = trainer.decisions.iter().any(|line| line.contains("antialiased"));
-            assert_eq!(told, trainer.recipe.render.antialias);
-            told
+            let reported = trainer.decisions.iter().any(|line| line.contains("antialiased"));
+            assert_eq!(reported, trainer.recipe.render.antialias);
+            reported
         };
         assert!(antialiased(Lens::fisheye([0.0; 4])));
         assert!(!antialiased(Lens::Pinhole) && !antialiased(Lens::Fov { omega: 0.5 }));

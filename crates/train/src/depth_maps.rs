@@ -16,39 +16,39 @@ use irradia_scene::{Camera, Dataset, DepthGrid, View};
 use rayon::prelude::*;
 
 /// Minimum number of points of a view to which its map is fitted.
-const ENOUGH_POINTS: usize = 16;
+const MIN_POINTS: usize = 16;
 /// Median relative error of the fitted depths at a view's points from which its map is not used: it shows something else.
-const WORST_FIT: f64 = 0.2;
+const MAX_FIT_ERROR: f64 = 0.2;
 /// Rounds of reweighted least squares.
-const ROUNDS: usize = 10;
+const FIT_ITERATIONS: usize = 10;
 /// Relative residual below which pairs have the same weight.
-const LEAST_RESIDUAL: f64 = 1e-3;
+const MIN_RESIDUAL: f64 = 1e-3;
 /// Depths outside the range of a view's points by more than this factor are extrapolated, and are not used.
-const BEYOND: f32 = 3.0;
+const MAX_EXTRAPOLATION: f32 = 3.0;
 
 /// The maps of a dataset's training views.
 #[derive(Default)]
 pub(crate) struct DepthMaps {
     /// By view.
-    of: Vec<Option<Known>>,
+    by_view: Vec<Option<UsableMap>>,
     /// What was found, one line.
     pub summary: String,
 }
 
 /// The map of a view, as the loss uses it.
-struct Known {
+struct UsableMap {
     grid: DepthGrid,
     kind: DepthKind,
 }
 
 /// The meaning of a map's values.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Values {
+enum ValueKind {
     Depths,
     Inverses,
 }
 
-impl Values {
+impl ValueKind {
     const BOTH: [Self; 2] = [Self::Depths, Self::Inverses];
 }
 
@@ -62,10 +62,10 @@ struct Line {
 }
 
 /// The map of a view, with its values and the depths of points at the same places.
-struct Read {
+struct LoadedMap {
     grid: DepthGrid,
     pairs: Vec<[f64; 2]>,
-    /// Lines through the pairs, in the order of [`Values::BOTH`]; `None` if there are too few pairs.
+    /// Lines through the pairs, in the order of [`ValueKind::BOTH`]; `None` if there are too few pairs.
     lines: Option<[Line; 2]>,
 }
 
@@ -85,9 +85,9 @@ impl DepthMaps {
             let grid = view.depth_map.as_ref()?.load();
             Some(grid.map(|grid| {
                 let pairs = pairs(dataset, view, &grid);
-                let enough = pairs.len() >= ENOUGH_POINTS;
-                Read {
-                    lines: enough.then(|| Values::BOTH.map(|values| Line::fit(&pairs, values))),
+                let enough = pairs.len() >= MIN_POINTS;
+                LoadedMap {
+                    lines: enough.then(|| ValueKind::BOTH.map(|values| Line::fit(&pairs, values))),
                     pairs,
                     grid,
                 }
@@ -101,28 +101,28 @@ impl DepthMaps {
         let errors = [0, 1].map(|i| lines.iter().map(|lines| lines[i].error).collect::<Vec<f64>>());
         let fitted = (!lines.is_empty()).then(|| errors.map(median));
         let values = match fitted {
-            Some([of_depths, of_inverses]) if of_inverses < of_depths => Values::Inverses,
-            _ => Values::Depths,
+            Some([of_depths, of_inverses]) if of_inverses < of_depths => ValueKind::Inverses,
+            _ => ValueKind::Depths,
         };
-        let mut of: Vec<Option<Known>> = dataset.views.iter().map(|_| None).collect();
+        let mut by_view: Vec<Option<UsableMap>> = dataset.views.iter().map(|_| None).collect();
         for (view, map) in dataset.train.iter().zip(maps) {
             let Some(Ok(map)) = map else { continue };
-            of[*view] = match map.lines {
+            by_view[*view] = match map.lines {
                 Some(lines) => {
                     let line = lines[values as usize];
-                    line.is_sound().then(|| map.in_world(&line, values))
+                    line.is_accurate().then(|| map.in_world(&line, values))
                 }
                 // Without points, only depths can be used.
-                None => (values == Values::Depths).then_some(Known {
+                None => (values == ValueKind::Depths).then_some(UsableMap {
                     grid: map.grid,
                     kind: DepthKind::Relative,
                 }),
             };
         }
-        let used = of.iter().flatten().count();
+        let used = by_view.iter().flatten().count();
         let kind = match values {
-            Values::Depths => "depths",
-            Values::Inverses => "inverse depths",
+            ValueKind::Depths => "depths",
+            ValueKind::Inverses => "inverse depths",
         };
         let fit = match fitted {
             Some(errors) => format!(
@@ -132,19 +132,19 @@ impl DepthMaps {
             None => "taken for depths, up to scale and shift".to_owned(),
         };
         Self {
-            of,
+            by_view,
             summary: format!("{used} of {given} given maps of depth are used ({fit}){broken}"),
         }
     }
 
     /// Whether no map can be used.
     pub fn is_empty(&self) -> bool {
-        self.of.iter().all(Option::is_none)
+        self.by_view.iter().all(Option::is_none)
     }
 
     /// The depths of `view` at the pixels of `camera`, and their kind.
     pub fn samples(&self, view: usize, camera: &Camera) -> Option<(Vec<DepthSample>, DepthKind)> {
-        let Known { grid, kind } = self.of.get(view)?.as_ref()?;
+        let UsableMap { grid, kind } = self.by_view.get(view)?.as_ref()?;
         let k = &camera.intrinsics;
         let known = grid.pixels(k.width, k.height).filter(|(_, depth)| is_known(**depth));
         let samples = known.map(|([x, y], depth)| DepthSample {
@@ -157,12 +157,12 @@ impl DepthMaps {
     }
 }
 
-impl Read {
+impl LoadedMap {
     /// The map with depths in world units; 0 where they are unknown or extrapolated.
-    fn in_world(mut self, line: &Line, values: Values) -> Known {
+    fn in_world(mut self, line: &Line, values: ValueKind) -> UsableMap {
         let depths = self.pairs.iter().map(|[_, depth]| *depth as f32);
         let (nearest, farthest) = depths.fold((f32::INFINITY, 0f32), |(near, far), z| (near.min(z), far.max(z)));
-        let range = nearest / BEYOND..=farthest * BEYOND;
+        let range = nearest / MAX_EXTRAPOLATION..=farthest * MAX_EXTRAPOLATION;
         for value in &mut self.grid.values {
             let depth = line.depth(f64::from(*value), values) as f32;
             *value = if is_known(*value) && range.contains(&depth) {
@@ -171,7 +171,7 @@ impl Read {
                 0.0
             };
         }
-        Known {
+        UsableMap {
             grid: self.grid,
             kind: DepthKind::Metric,
         }
@@ -181,18 +181,18 @@ impl Read {
 impl Line {
     /// The line through `[value, depth]` with the least absolute errors, relative to the depth. Its error is infinite if its scale is not
     /// positive.
-    fn fit(pairs: &[[f64; 2]], values: Values) -> Self {
+    fn fit(pairs: &[[f64; 2]], values: ValueKind) -> Self {
         let target = |z: f64| match values {
-            Values::Depths => z,
-            Values::Inverses => 1.0 / z,
+            ValueKind::Depths => z,
+            ValueKind::Inverses => 1.0 / z,
         };
-        let mut line = Self::through_halves(pairs.iter().map(|[value, z]| [*value, target(*z)]).collect());
-        for _ in 0..ROUNDS {
+        let mut line = Self::theil_sen(pairs.iter().map(|[value, z]| [*value, target(*z)]).collect());
+        for _ in 0..FIT_ITERATIONS {
             let (mut w, mut x, mut y, mut xx, mut xy) = (0.0, 0.0, 0.0, 0.0, 0.0);
             for [value, z] in pairs {
                 let t = target(*z);
                 let residual = (line.scale * value + line.shift) / t - 1.0;
-                let weight = 1.0 / (residual.abs().max(LEAST_RESIDUAL) * t * t);
+                let weight = 1.0 / (residual.abs().max(MIN_RESIDUAL) * t * t);
                 (w, x, y) = (w + weight, x + weight * value, y + weight * t);
                 (xx, xy) = (xx + weight * value * value, xy + weight * value * t);
             }
@@ -215,7 +215,7 @@ impl Line {
 
     /// A line that is robust to wrong pairs, up to a quarter of all: the median of the slopes between values of the lower half and those of
     /// the upper half (Theil 1950, Sen 1968), and the median shift.
-    fn through_halves(mut pairs: Vec<[f64; 2]>) -> Self {
+    fn theil_sen(mut pairs: Vec<[f64; 2]>) -> Self {
         pairs.sort_by(|a, b| a[0].total_cmp(&b[0]));
         let (lower, upper) = pairs.split_at(pairs.len() / 2);
         let rises = lower.iter().zip(upper).filter(|(a, b)| b[0] > a[0]);
@@ -228,16 +228,16 @@ impl Line {
         }
     }
 
-    fn depth(&self, value: f64, values: Values) -> f64 {
+    fn depth(&self, value: f64, values: ValueKind) -> f64 {
         let on_line = self.scale * value + self.shift;
         match values {
-            Values::Depths => on_line,
-            Values::Inverses => 1.0 / on_line,
+            ValueKind::Depths => on_line,
+            ValueKind::Inverses => 1.0 / on_line,
         }
     }
 
-    fn is_sound(&self) -> bool {
-        self.error < WORST_FIT
+    fn is_accurate(&self) -> bool {
+        self.error < MAX_FIT_ERROR
     }
 }
 

@@ -12,7 +12,7 @@ use irradia_splat::{Engine, RenderOptions, Update};
 use {
     crate::objective::{cover_weight, photometric_weights},
     crate::recipe::Param,
-    irradia_measure::gpu::{Beside, DeviceFrame, GpuLoss},
+    irradia_measure::gpu::{DeviceFrame, ExtraTerms, GpuLoss},
     irradia_measure::{Target, Truth},
     irradia_splat::{DeviceGradient, Statistics},
 };
@@ -30,45 +30,45 @@ pub(crate) fn use_device(
         return Ok(Vec::new());
     }
     let fields = (0..recipe.stage.len()).filter(|stage| is_field(recipe, *stage)).count();
-    let mut told = Vec::new();
+    let mut decisions = Vec::new();
     if fields < recipe.stage.len() {
-        told.push(if recipe.residual.is_some() {
+        decisions.push(if recipe.residual.is_some() {
             format!("splats with a residual field are trained on the CPU, not on {device}")
         } else if !cameras.iter().all(Camera::is_pinhole) {
             format!("splats in photographs with distortion or a rolling shutter are trained on the CPU, not on {device}")
         } else {
             engine.use_device(device)?;
-            let most = engine.most_splats();
-            if first_splats > most {
+            let limit = engine.max_splats();
+            if first_splats > limit {
                 engine.use_device(&Device::Cpu)?;
-                format!("splats are trained on the CPU: {device} has room for {most} of {first_splats} (--max-splats {most})")
-            } else if recipe.max_splats > most {
-                format!("splats are trained on {device}, which has room for {most}")
+                format!("splats are trained on the CPU: {device} has room for {limit} of {first_splats} (--max-splats {limit})")
+            } else if recipe.max_splats > limit {
+                format!("splats are trained on {device}, which has room for {limit}")
             } else {
                 format!("splats are trained on {device}")
             }
         });
     }
     if fields > 0 {
-        told.push(if has_form(recipe) {
+        decisions.push(if supports_field(recipe) {
             format!("the field is trained on {device}")
         } else {
             format!("the field is trained on the CPU, not on {device}, which only supports hash grids with occupancy")
         });
     }
-    Ok(told)
+    Ok(decisions)
 }
 
 /// Whether the recipe's field can be trained on a GPU.
 #[cfg(feature = "gpu")]
-fn has_form(recipe: &Recipe) -> bool {
+fn supports_field(recipe: &Recipe) -> bool {
     let space = irradia_field::Space::contracted([0.0; 3], 1.0);
     let config = recipe.field.as_ref().map(|knobs| knobs.config(1, &space, false));
     config.is_some_and(|config| irradia_field::gpu::supports(&config))
 }
 
 #[cfg(not(feature = "gpu"))]
-fn has_form(_: &Recipe) -> bool {
+fn supports_field(_: &Recipe) -> bool {
     false
 }
 
@@ -145,7 +145,7 @@ impl DeviceLoss {
             let values = self.begin(engine, reference, plan, false)?;
             engine.update(update);
             let values = values.finish();
-            if engine.settle() {
+            if engine.finish_frame() {
                 return Some(values);
             }
         }
@@ -173,7 +173,7 @@ impl DeviceLoss {
         reference: &Reference,
         plan: &StepPlan,
         camera: bool,
-    ) -> Option<ValuesToCome<'_>> {
+    ) -> Option<PendingValues<'_>> {
         let loss = self.gpu.as_mut()?;
         let [planes, v_planes] = engine.device_frame()?;
         let photo = reference.photo;
@@ -184,14 +184,14 @@ impl DeviceLoss {
             mask: photo.mask.as_deref(),
         };
         let depth_weight = plan.value(Param::DepthWeight);
-        let beside = Beside {
+        let extra = ExtraTerms {
             depths: reference.depths,
             depth_weight,
             cover_weight: cover_weight(photo, plan),
             error: plan.gathers == Some(Statistics::Error),
         };
         let frame = DeviceFrame { planes, v_planes };
-        loss.begin(&frame, &target, &photometric_weights(plan), &beside);
+        loss.begin(&frame, &target, &photometric_weights(plan), &extra);
         let has_depth = !reference.depths.is_empty();
         engine.backward_on_device(&DeviceGradient {
             alpha: has_depth || cover_weight(photo, plan) > 0.0,
@@ -199,19 +199,19 @@ impl DeviceLoss {
             gather: plan.gathers.filter(|what| *what != Statistics::Gradient),
             camera,
         });
-        Some(ValuesToCome { loss, depth_weight })
+        Some(PendingValues { loss, depth_weight })
     }
 }
 
 /// Losses that the device is still computing.
 #[cfg(feature = "gpu")]
-struct ValuesToCome<'a> {
+struct PendingValues<'a> {
     loss: &'a mut GpuLoss,
     depth_weight: f32,
 }
 
 #[cfg(feature = "gpu")]
-impl ValuesToCome<'_> {
+impl PendingValues<'_> {
     fn finish(self) -> ObjectiveValues {
         let values = self.loss.finish();
         ObjectiveValues {
@@ -261,25 +261,25 @@ mod tests {
             return;
         };
         let recipe = Recipe::parse("mcmc", Recipe::built_in("mcmc").unwrap(), &[]).unwrap();
-        let told_of = |splats: usize| {
+        let decision_for = |splats: usize| {
             let mut engine = Engine::new(SplatState::new(Splats::zeros(0, sh::MAX_DEGREE)));
-            let told = use_device(&mut engine, &device, &recipe, splats, &[])
+            let decision = use_device(&mut engine, &device, &recipe, splats, &[])
                 .unwrap()
                 .remove(0);
-            (engine.is_on_gpu(), engine.most_splats(), told)
+            (engine.is_on_gpu(), engine.max_splats(), decision)
         };
-        let (is_on_gpu, most, told) = told_of(1000);
-        assert!(is_on_gpu && told.contains("trained on the GPU"), "{told}");
+        let (is_on_gpu, most, decision) = decision_for(1000);
+        assert!(is_on_gpu && decision.contains("trained on the GPU"), "{decision}");
         let Device::Gpu(gpu) = &device else { unreachable!() };
         assert!(
             192 * most as u64 <= gpu.info().largest_array,
             "harmonics of degree 3 take 192 bytes a splat"
         );
-        let (is_on_gpu, any, told) = told_of(most + 1);
+        let (is_on_gpu, any, decision) = decision_for(most + 1);
         assert!(!is_on_gpu && any == usize::MAX);
         assert!(
-            told.contains("on the CPU") && told.contains(&format!("--max-splats {most}")),
-            "{told}"
+            decision.contains("on the CPU") && decision.contains(&format!("--max-splats {most}")),
+            "{decision}"
         );
     }
 }

@@ -30,10 +30,14 @@ pub(crate) fn edges(photo: &Prepared, edges: &mut Vec<f32>) {
 
 /// The minimum of `values`, and the factor that scales their range to 1; 0 if they are all equal.
 pub(crate) fn unit_range(values: &[f32]) -> [f32; 2] {
-    let least = values.iter().copied().fold(f32::INFINITY, f32::min);
+    let smallest = values.iter().copied().fold(f32::INFINITY, f32::min);
     let largest = values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
-    let scale = if largest > least { 1.0 / (largest - least) } else { 0.0 };
-    [least, scale]
+    let scale = if largest > smallest {
+        1.0 / (largest - smallest)
+    } else {
+        0.0
+    };
+    [smallest, scale]
 }
 
 #[cfg(test)]

@@ -19,9 +19,9 @@ use std::ops::ControlFlow;
 pub const MAX_PSNR: f64 = 100.0;
 
 /// Maximum bytes of the views that are evaluated at the same time.
-const AT_ONCE: usize = 256 << 20;
+const MAX_BATCH_BYTES: usize = 256 << 20;
 /// Bytes per pixel of such a view: the photograph, and both images as floats.
-const PIXEL: usize = 3 + 2 * 12;
+const BYTES_PER_PIXEL: usize = 3 + 2 * 12;
 
 /// The result of one view with its images, `[H, W, 3]`.
 pub struct EvaluatedView {
@@ -68,8 +68,8 @@ pub struct EvalOptions<'a> {
     pub device: &'a Device,
 }
 
-/// Renders `model` from the views `indices` of `dataset` and compares the frames with their photographs; passes each result to `see`, which
-/// may end the evaluation.
+/// Renders `model` from the views `indices` of `dataset` and compares the frames with their photographs; passes each result to `visit`,
+/// which may end the evaluation.
 ///
 /// # Errors
 /// When a photograph cannot be read, or the device fails.
@@ -78,14 +78,14 @@ pub fn evaluate_views(
     dataset: &Dataset,
     indices: &[usize],
     options: &EvalOptions,
-    mut see: impl FnMut(EvaluatedView) -> ControlFlow<()>,
+    mut visit: impl FnMut(EvaluatedView) -> ControlFlow<()>,
 ) -> Result<(), TrainError> {
     let (mut painter, mut renderer) = (Painter::new(model, options.device)?, Renderer::new());
     let cameras: Vec<Camera> = dataset.train.iter().map(|i| dataset.views[*i].camera).collect();
     let extent = camera_extent(&cameras);
     let views = indices.iter().map(|index| &dataset.views[*index]);
     let background = options.render.background;
-    for batch in indices.chunks(at_once(views)) {
+    for batch in indices.chunks(batch_size(views)) {
         // Photographs are decoded by one thread each; a frame is rendered by all threads, or the device.
         let load = |index: &usize| {
             let view = &dataset.views[*index];
@@ -125,14 +125,14 @@ pub fn evaluate_views(
             metrics.psnr = metrics.psnr.clamp(f64::NEG_INFINITY, MAX_PSNR);
             metrics.psnr_corrected = metrics.psnr_corrected.clamp(f64::NEG_INFINITY, MAX_PSNR);
             metrics.half_fit_psnr = metrics.half_fit_psnr.map(|psnr| psnr.min(MAX_PSNR));
-            let seen = see(EvaluatedView {
+            let flow = visit(EvaluatedView {
                 name: view.name.clone(),
                 metrics,
                 truth,
                 render,
                 mask,
             });
-            if seen.is_break() {
+            if flow.is_break() {
                 return Ok(());
             }
         }
@@ -153,10 +153,10 @@ fn measure(render: &Image, truth: &Image, mask: Option<&[u8]>, metrics: Metrics)
 }
 
 /// Number of views that are evaluated at the same time: one per thread, if they are small.
-fn at_once<'a>(views: impl Iterator<Item = &'a View>) -> usize {
+fn batch_size<'a>(views: impl Iterator<Item = &'a View>) -> usize {
     let pixels = views.map(|view| view.camera.intrinsics.width as usize * view.camera.intrinsics.height as usize);
     let largest = pixels.max().unwrap_or(0).max(1);
-    (AT_ONCE / (PIXEL * largest)).clamp(1, rayon::current_num_threads())
+    (MAX_BATCH_BYTES / (BYTES_PER_PIXEL * largest)).clamp(1, rayon::current_num_threads())
 }
 
 /// `render` `[H, W, 3]` as the lens of `camera` shows it.
@@ -266,11 +266,11 @@ mod tests {
             };
             let data = dataset();
             views.clear();
-            let see = |view| {
+            let visit = |view| {
                 views.push(view);
                 ControlFlow::Continue(())
             };
-            evaluate_views(&model, &data, &data.test, &options, see).unwrap();
+            evaluate_views(&model, &data, &data.test, &options, visit).unwrap();
             let measured: Vec<bool> = views.iter().map(EvaluatedView::is_measured).collect();
             assert_eq!(measured, [true, false, true]);
             let metrics: Vec<Evaluation> = views.iter().map(|view| view.metrics).collect();

@@ -14,17 +14,17 @@ use crate::trainer::{TrainError, Trainer};
 use irradia_scene::Camera;
 
 /// Fraction of a run after which the decision is made.
-pub(crate) const AT: f64 = 0.1;
+pub(crate) const PROBE_AT: f64 = 0.1;
 /// Maximum number of training views to measure: enough for a standard deviation accurate to a tenth.
-const VIEWS: usize = 64;
+const MAX_VIEWS: usize = 64;
 /// Minimum number of views for a decision.
 const MIN_VIEWS: usize = 8;
 /// Number of cameras that predict a view's exposure.
 const NEIGHBOURS: usize = 3;
 /// Minimum standard deviation of ln exposure, beyond its prediction, at which exposures are learned.
-const THRESHOLD: f64 = 0.1;
+const MIN_DEVIATION: f64 = 0.1;
 /// Usable colours: those outside are clipped in the photograph, or too dark for a ratio.
-const USABLE: std::ops::RangeInclusive<f32> = 8.0 / 255.0..=250.0 / 255.0;
+const USABLE_COLORS: std::ops::RangeInclusive<f32> = 8.0 / 255.0..=250.0 / 255.0;
 /// Minimum number of usable pixels of a view; a view with fewer is skipped.
 const MIN_PIXELS: usize = 100;
 
@@ -39,7 +39,7 @@ fn log_exposure(color: &[f32], photo: &Prepared) -> Option<f64> {
     for i in (0..pixels).filter(counts) {
         let truth: [f32; 3] = std::array::from_fn(|c| f32::from(photo.rgb[3 * i + c]) / 255.0);
         let frame: [f32; 3] = std::array::from_fn(|c| color[c * pixels + i]);
-        if truth.iter().chain(&frame).all(|v| USABLE.contains(v)) {
+        if truth.iter().chain(&frame).all(|v| USABLE_COLORS.contains(v)) {
             ratios += 1;
             photo_sum += f64::from(truth.iter().sum::<f32>());
             frame_sum += f64::from(frame.iter().sum::<f32>());
@@ -50,7 +50,7 @@ fn log_exposure(color: &[f32], photo: &Prepared) -> Option<f64> {
 
 /// Standard deviation of the ln exposures of `views` beyond what the nearest cameras predict; `None` for too few views. `unit` is
 /// the extent of the scene, which makes a turn by one radian count as much as a move by one extent.
-fn unpredicted(views: &[(Camera, f64)], unit: f32) -> Option<f64> {
+fn unpredicted_spread(views: &[(Camera, f64)], unit: f32) -> Option<f64> {
     if views.len() < MIN_VIEWS {
         return None;
     }
@@ -74,15 +74,15 @@ impl Trainer {
     pub(crate) fn decide_exposure(&mut self) -> Result<Option<Event>, TrainError> {
         let plan = plan(&self.recipe, &self.clock);
         let mut measured = Vec::new();
-        self.show_training_views(VIEWS, &plan, false, |trainer, view, photo| {
+        self.render_training_views(MAX_VIEWS, &plan, false, |trainer, view, photo| {
             let color = trainer.sockets.frame_color(&trainer.engine);
             measured.extend(log_exposure(color, photo).map(|log| (view, log)));
         })?;
         let views: Vec<(Camera, f64)> = measured.iter().map(|(view, log)| (self.camera(*view), *log)).collect();
-        let Some(spread) = unpredicted(&views, self.extent) else {
+        let Some(spread) = unpredicted_spread(&views, self.extent) else {
             return Ok(None);
         };
-        if spread < THRESHOLD {
+        if spread < MIN_DEVIATION {
             return Ok(None);
         }
         let exposure = Exposure::new(self.dataset.views.len(), &self.dataset.train).with_gains(&measured);
@@ -119,12 +119,12 @@ mod tests {
             angles.map(|angle| (camera(angle), log(angle))).collect()
         };
         let smooth = around(&mut |angle| 0.3 * f64::from(angle.sin()));
-        let measured = unpredicted(&smooth, 1.0).unwrap();
+        let measured = unpredicted_spread(&smooth, 1.0).unwrap();
         assert!(measured < 0.03, "{measured}");
         let random = around(&mut |_| f64::from(rng.normal()) * 0.2);
-        let measured = unpredicted(&random, 1.0).unwrap();
+        let measured = unpredicted_spread(&random, 1.0).unwrap();
         assert!((measured - 0.2).abs() < 0.06, "{measured}");
-        assert_eq!(unpredicted(&random[..7], 1.0), None);
+        assert_eq!(unpredicted_spread(&random[..7], 1.0), None);
     }
 
     #[test]

@@ -7,8 +7,8 @@ use safetensors::tensor::SafeTensors;
 use serde::{Deserialize, Serialize};
 
 /// The header's only key.
-const KEY: &str = "irradia_field";
-const FORMAT: u32 = 1;
+const METADATA_KEY: &str = "irradia_field";
+const FORMAT_VERSION: u32 = 1;
 
 /// The content of the header.
 #[derive(Serialize, Deserialize)]
@@ -22,15 +22,15 @@ struct Header {
 pub fn to_bytes(field: &Field) -> Vec<u8> {
     let tensors = field.tensors().into_iter();
     let tensors: Vec<NamedTensor> = tensors
-        .map(|(name, shape, values)| NamedTensor::real(name, shape, values))
+        .map(|(name, shape, values)| NamedTensor::f32s(name, shape, values))
         .collect();
     let header = Header {
-        format: FORMAT,
+        format: FORMAT_VERSION,
         config: field.config.clone(),
         space: field.space,
     };
     let header = serde_json::to_string(&header).expect("plain values");
-    tensor_file::to_bytes(&tensors, (KEY, header))
+    tensor_file::to_bytes(&tensors, (METADATA_KEY, header))
 }
 
 /// The inverse of [`to_bytes`].
@@ -41,15 +41,18 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Field, TrainError> {
     let wrong = |why: String| TrainError::Checkpoint(format!("not a field of this program: {why}"));
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| wrong(e.to_string()))?;
     let file = SafeTensors::deserialize(bytes).map_err(|e| wrong(e.to_string()))?;
-    let text = header.metadata().as_ref().and_then(|metadata| metadata.get(KEY));
+    let text = header
+        .metadata()
+        .as_ref()
+        .and_then(|metadata| metadata.get(METADATA_KEY));
     let text = text.ok_or_else(|| wrong("its header does not describe one".into()))?;
     let header: Header = serde_json::from_str(text).map_err(|e| wrong(e.to_string()))?;
-    if header.format != FORMAT {
-        return Err(wrong(format!("format {}, expected {FORMAT}", header.format)));
+    if header.format != FORMAT_VERSION {
+        return Err(wrong(format!("format {}, expected {FORMAT_VERSION}", header.format)));
     }
     header.config.check()?;
     // Before allocating what the header merely claims.
-    let (wanted, found) = (header.config.numbers(), bytes.len() / size_of::<f32>());
+    let (wanted, found) = (header.config.value_count(), bytes.len() / size_of::<f32>());
     if wanted > found {
         return Err(wrong(format!(
             "it should hold {wanted} numbers and has room for {found}"
@@ -61,16 +64,16 @@ pub fn from_bytes(bytes: &[u8]) -> Result<Field, TrainError> {
     }
     let tensors = TensorSource::new(&file, "");
     Ok(Field::from_tensors(header.config, header.space, |name| {
-        tensors.real(name)
+        tensors.f32s(name)
     })?)
 }
 
 /// A field in training, for a checkpoint.
 pub(crate) fn state_tensors(state: &FieldState) -> Vec<NamedTensor> {
     let tensors = state.tensors().into_iter();
-    let whole = NamedTensor::whole("whole", &[state.step, state.rays as u64]);
+    let whole = NamedTensor::u64s("whole", &[state.step, state.rays as u64]);
     tensors
-        .map(|(name, shape, values)| NamedTensor::real(name, shape, values))
+        .map(|(name, shape, values)| NamedTensor::f32s(name, shape, values))
         .chain([whole])
         .collect()
 }
@@ -80,10 +83,10 @@ pub(crate) fn state_tensors(state: &FieldState) -> Vec<NamedTensor> {
 /// # Errors
 /// One line, when a tensor is missing or has another length.
 pub(crate) fn state_from(config: FieldConfig, space: Space, tensors: TensorSource) -> Result<FieldState, String> {
-    let whole = tensors.whole("whole").unwrap_or_default();
+    let whole = tensors.u64s("whole").unwrap_or_default();
     let [step, rays] = whole[..] else {
         return Err("whole is missing or has the wrong length".into());
     };
-    FieldState::from_tensors(config, space, step, rays as usize, |name| tensors.real(name))
+    FieldState::from_tensors(config, space, step, rays as usize, |name| tensors.f32s(name))
         .map_err(|error| error.to_string())
 }

@@ -9,7 +9,7 @@ use irradia_scene::{Camera, Dataset, PointCloud, View};
 /// Factor on the nearest depth of the scene, which leaves a margin (NeRF's code: 0.9).
 const NEAR_MARGIN: f32 = 0.9;
 /// Fraction of a view's points that are nearer than its near depth (LLFF's `imgs2poses`: 0.1 percent).
-const NEARER: f32 = 0.001;
+const OUTLIER_FRACTION: f32 = 0.001;
 
 /// The space of a field trained on `dataset`, and why, in one line. `transparent`: photographs have alpha.
 ///
@@ -95,7 +95,7 @@ fn near_depth(view: &View, points: &PointCloud) -> Option<f32> {
         let seen = view.points_seen.iter().map(|i| &points.positions[*i as usize]);
         seen.filter_map(depth).collect()
     };
-    let place = (NEARER * depths.len() as f32) as usize;
+    let place = (OUTLIER_FRACTION * depths.len() as f32) as usize;
     (!depths.is_empty()).then(|| *depths.select_nth_unstable_by(place, f32::total_cmp).1)
 }
 

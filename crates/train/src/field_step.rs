@@ -17,11 +17,11 @@ use std::time::Instant;
 const STREAM_FIELD: u64 = 6;
 const STREAM_POINTS: u64 = 7;
 /// Memory of all photographs, bytes, above which a step uses only some of them: 5,500 of 360 x 360.
-pub const ALL_PHOTOS: usize = 2 << 30;
+pub const MAX_PHOTO_BYTES: usize = 2 << 30;
 /// Bytes of a pixel of a training photograph: four channels, or three and a mask.
-pub const PHOTO_PIXEL: usize = 4;
+pub const BYTES_PER_PHOTO_PIXEL: usize = 4;
 /// Number of photographs per step if all together exceed it.
-const SHARED: usize = 16;
+const PHOTOS_PER_STEP: usize = 16;
 /// Whether stage `stage` trains a field.
 pub fn is_field(recipe: &Recipe, stage: usize) -> bool {
     let stage = &recipe.stage[stage.min(recipe.stage.len() - 1)];
@@ -143,14 +143,14 @@ impl Trainer {
             .iter()
             .map(|view| {
                 let k = &self.dataset.views[*view].camera.intrinsics;
-                PHOTO_PIXEL * k.width as usize * k.height as usize
+                BYTES_PER_PHOTO_PIXEL * k.width as usize * k.height as usize
             })
             .sum();
-        if bytes <= ALL_PHOTOS {
+        if bytes <= MAX_PHOTO_BYTES {
             return self.dataset.train.clone();
         }
         let mut upcoming = upcoming_views(&self.dataset.train, self.options.seed, &self.clock);
-        upcoming.truncate(SHARED);
+        upcoming.truncate(PHOTOS_PER_STEP);
         upcoming
     }
 

@@ -9,12 +9,12 @@ use irradia_splat::Splats;
 use irradia_splat::init::{self, InitOptions, PixelClass};
 
 /// Fewer points than these are not used as first splats.
-const FEWEST_POINTS: usize = 10;
+const MIN_POINTS: usize = 10;
 
 /// Maximum number of training views from which random first splats get their colours, evenly spaced.
-const FIRST_VIEWS: usize = 256;
+const MAX_COLOR_VIEWS: usize = 256;
 /// Scale at which photographs are read for these colours, if that takes less time than at full size.
-const FIRST_SCALE: f32 = 0.25;
+const COLOR_SCALE: f32 = 0.25;
 
 impl Trainer {
     /// Options of the first splats.
@@ -29,17 +29,17 @@ impl Trainer {
     pub(crate) fn first_splats(&mut self) -> Result<Splats, TrainError> {
         let options = self.init_options();
         let dataset = self.dataset.clone();
-        let most = self.recipe.max_splats;
+        let max_splats = self.recipe.max_splats;
         let splats = match enough_points(&dataset) {
             // Evenly over the file: SfM writes points in the order in which it finds them, region by region.
-            Some(points) if points.len() > most => {
-                let chosen = (0..most).map(|i| i * points.len() / most);
+            Some(points) if points.len() > max_splats => {
+                let chosen = (0..max_splats).map(|i| i * points.len() / max_splats);
                 let (positions, colors) = chosen.map(|i| (points.positions[i], points.colors[i])).unzip();
                 init::from_points(&PointCloud { positions, colors }, &options)
             }
             Some(points) => init::from_points(points, &options),
             None => {
-                let stride = dataset.train.len().div_ceil(FIRST_VIEWS);
+                let stride = dataset.train.len().div_ceil(MAX_COLOR_VIEWS);
                 let chosen: Vec<usize> = dataset.train.iter().copied().step_by(stride).collect();
                 let views: Vec<&View> = chosen.iter().map(|i| &dataset.views[*i]).collect();
                 let cameras: Vec<Camera> = views.iter().map(|v| v.camera).collect();
@@ -48,13 +48,13 @@ impl Trainer {
                 let points = init::random_points(
                     &cameras,
                     &bounds,
-                    self.recipe.init.random_points.min(most),
+                    self.recipe.init.random_points.min(max_splats),
                     &mut rng,
                     |view| {
                         let k = cameras[view].intrinsics;
-                        let small = k.scaled(FIRST_SCALE);
+                        let small = k.scaled(COLOR_SCALE);
                         let is_quick = !views[view].photo.is_shrunk_from_full(small.width, small.height);
-                        let scale = if is_quick { FIRST_SCALE } else { 1.0 };
+                        let scale = if is_quick { COLOR_SCALE } else { 1.0 };
                         let photo = self.photos.get(&chosen[view..], scale)?;
                         Ok::<_, LoadError>(move |pixel: Vec2| {
                             let x = pixel.x as usize * photo.width as usize / k.width as usize;
@@ -88,7 +88,7 @@ pub(crate) fn has_points(dataset: &Dataset) -> bool {
 }
 
 fn enough_points(dataset: &Dataset) -> Option<&PointCloud> {
-    dataset.points.as_ref().filter(|points| points.len() >= FEWEST_POINTS)
+    dataset.points.as_ref().filter(|points| points.len() >= MIN_POINTS)
 }
 
 /// Number of splats with which a training begins.

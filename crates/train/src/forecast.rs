@@ -10,44 +10,44 @@ use crate::trainer::Trainer;
 /// Work of a step, microseconds on one core (AVX-512), by least squares of the relative error over the first 250 to 500 steps of
 /// six runs: chair with `classic`, `fast` and `curriculum`, fox_colmap with `fast`, fern with `mcmc`, demo with `classic`. Measured
 /// steps were 0.65 to 1.22 of the prediction. Per pixel,
-const PIXEL: f64 = 0.09;
+const PIXEL_COST: f64 = 0.09;
 /// per splat-pixel pair visited by blending,
-const PAIR: f64 = 0.00065;
+const PAIR_COST: f64 = 0.00065;
 /// per splat,
-const SPLAT: f64 = 0.26;
+const SPLAT_COST: f64 = 0.26;
 /// per parameter of a splat in use,
-const PARAMETER: f64 = 0.0016;
+const PARAMETER_COST: f64 = 0.0016;
 /// per pixel of the LPIPS crop,
-const PERCEPTUAL_PIXEL: f64 = 1.15;
+const PERCEPTUAL_PIXEL_COST: f64 = 1.15;
 /// and per sample of a field.
-const SAMPLE: f64 = 2.0;
+const SAMPLE_COST: f64 = 2.0;
 /// Parameters of a splat other than its harmonics.
-const GEOMETRY: f64 = 11.0;
+const GEOMETRY_PARAMETERS: f64 = 11.0;
 /// Pairs per pixel grow with the number of splats and shrink with the images' sides, both to this power (31 to 780 were seen);
-const PAIRS_POWER: f64 = 0.5;
+const PAIRS_EXPONENT: f64 = 0.5;
 /// `mcmc` adds splats as large as those that it copies (0.7 to 0.9 on fox, lund_door, maryRose).
-const MCMC_PAIRS_POWER: f64 = 0.75;
+const MCMC_PAIRS_EXPONENT: f64 = 0.75;
 /// Number of points in time at which the rest of the run is evaluated.
-const PARTS: usize = 48;
+const FORECAST_PARTS: usize = 48;
 /// Steps between two measurements of a run without a budget, since each walks all tile entries and the rest of the recipe: at
 /// most this many,
-const MEASURE_EVERY: usize = 16;
+const MAX_MEASURE_INTERVAL: usize = 16;
 /// and at most this fraction (one over it) of the steps completed, since costs change fast at first.
-const MEASURE_PART: usize = 16;
+const MEASURE_DIVISOR: usize = 16;
 /// Steps over which costs are averaged, but at most the last quarter, since costs change fast at first.
-const WINDOW: usize = 50;
+const MAX_WINDOW: usize = 50;
 /// Overdraw is not predicted to fall below this fraction of its current value.
-const MIN_SETTLED: f64 = 0.25;
+const MIN_OVERDRAW_FRACTION: f64 = 0.25;
 /// Growth factor of the splats added per round of `classic` in its first rounds (1.5 on chair, 2.3 on fox_colmap, of 1000 and 2000 steps).
-const FIRST_ROUNDS_GROW: f64 = 1.5;
-const FIRST_ROUNDS: u32 = 3;
+const EARLY_GROWTH: f64 = 1.5;
+const EARLY_ROUNDS: u32 = 3;
 /// Then it decays, to 1 / e in this many steps (1,300 on demo, 3,300 on fox_colmap, 5,000 on chair, 6,000 on fern).
-const GROWTH_FADES: f64 = 3000.0;
+const GROWTH_DECAY_STEPS: f64 = 3000.0;
 /// The strategy `fast` converges to a number of splats that grows with the images: pixels to this power (2.3 times for images of
 /// twice the side; 1.8 to 2.6 on five scenes),
-const SPLATS_BY_PIXELS: f64 = 0.6;
+const SPLATS_EXPONENT: f64 = 0.6;
 /// within this fraction of the recipe.
-const SPLATS_FOLLOW: f64 = 0.12;
+const CONVERGENCE_FRACTION: f64 = 0.12;
 
 /// How far off a prediction may be, as a factor either way: up to a tenth of the recipe, and from nine tenths on; in between it falls
 /// evenly in the logarithm. Over 21 runs of two recipes on six scenes, on a busy machine, the remaining time was within this range in 92 %
@@ -76,9 +76,9 @@ pub struct Forecast {
     /// Pairs per pixel of each splat step, normalised to an image scale and a number of splats of 1.
     overdraws: Vec<f64>,
     /// Seconds per unit of work, a moving average.
-    unit: Option<f64>,
+    work_seconds: Option<f64>,
     /// Seconds that the rest of the run takes at a pace of 1.
-    whole: f64,
+    rest_seconds: f64,
     /// Mean pixels of a training image.
     pixels: f64,
     /// Recipe time and number of splats when that number last changed, or the stage began.
@@ -90,12 +90,12 @@ pub struct Forecast {
     /// Size of the training images.
     image_scale: f64,
     /// Target of `fast` since images have grown.
-    aim: Option<Aim>,
+    target: Option<TargetCount>,
 }
 
 /// A target number of splats.
 #[derive(Clone, Copy, Debug)]
-struct Aim {
+struct TargetCount {
     count: f64,
     /// Splats added per recipe step.
     rate: f64,
@@ -103,14 +103,14 @@ struct Aim {
     until: f64,
 }
 
-impl Aim {
+impl TargetCount {
     /// The target after the sides of images grow by `factor` at `time`, with `count` splats.
     fn new(trainer: &Trainer, factor: f64, time: f64, count: f64) -> Self {
-        let follow = SPLATS_FOLLOW * trainer.recipe.total_steps() as f64;
-        let aim = count * factor.powi(2).powf(SPLATS_BY_PIXELS);
+        let follow = CONVERGENCE_FRACTION * trainer.recipe.total_steps() as f64;
+        let target = count * factor.powi(2).powf(SPLATS_EXPONENT);
         Self {
-            count: aim,
-            rate: (aim - count) / follow,
+            count: target,
+            rate: (target - count) / follow,
             until: time + follow,
         }
     }
@@ -118,7 +118,7 @@ impl Aim {
 
 impl Forecast {
     /// Measures the cost of the last steps; called before each step with its `plan`. A run whose pace follows the forecast measures
-    /// every step (`closely`), others ever less often, down to one in [`MEASURE_EVERY`].
+    /// every step (`closely`), others ever less often, down to one in [`MAX_MEASURE_INTERVAL`].
     pub fn observe(&mut self, trainer: &Trainer, plan: &StepPlan, closely: bool) {
         if self.pixels == 0.0 {
             let cameras = trainer.train_cameras();
@@ -132,7 +132,7 @@ impl Forecast {
         let other = self.next.is_some_and(|(step, _)| {
             step.stage != trainer.clock.stage || (f64::from(plan.image_scale) / step.image_scale - 1.0).abs() > 0.05
         });
-        if !closely && !other && self.since < (self.steps / MEASURE_PART).min(MEASURE_EVERY) {
+        if !closely && !other && self.since < (self.steps / MEASURE_DIVISOR).min(MAX_MEASURE_INTERVAL) {
             return;
         }
         if let Some((step, count)) = self.next.take() {
@@ -142,19 +142,22 @@ impl Forecast {
             let pairs = trainer.engine.pairs() as f64 / (self.pixels * step.image_scale.powi(2));
             // A field has no pairs, and does not predict those of later splats.
             if pairs > 0.0 {
-                let power = pairs_power(trainer);
+                let power = pairs_exponent(trainer);
                 let overdraw = pairs / (count.max(1.0) / step.image_scale).powf(power);
                 self.overdraws
                     .resize(self.overdraws.len() + self.steps - before, overdraw);
             }
             let seconds = (trainer.seconds - self.seconds) / self.since as f64;
-            let unit = seconds / self.work(trainer, &step, count, pairs);
-            self.unit = Some(self.unit.map_or(unit, |mean| mean + share * (unit - mean)));
+            let work_seconds = seconds / self.work(trainer, &step, count, pairs);
+            self.work_seconds = Some(
+                self.work_seconds
+                    .map_or(work_seconds, |mean| mean + share * (work_seconds - mean)),
+            );
         }
         (self.seconds, self.since) = (trainer.seconds, 0);
-        let upcoming = upcoming(&trainer.recipe, &trainer.clock, PARTS);
+        let upcoming = upcoming(&trainer.recipe, &trainer.clock, FORECAST_PARTS);
         self.next = upcoming.first().map(|next| (*next, trainer.engine.len() as f64));
-        self.whole = self.predict(trainer, &upcoming);
+        self.rest_seconds = self.predict(trainer, &upcoming);
     }
 
     /// Updates growth with the number of splats and the image size of the next step.
@@ -172,23 +175,23 @@ impl Forecast {
         }
         let image_scale = f64::from(plan.image_scale);
         if self.image_scale > 0.0 && image_scale > self.image_scale {
-            self.aim = Some(Aim::new(trainer, image_scale / self.image_scale, time, count));
+            self.target = Some(TargetCount::new(trainer, image_scale / self.image_scale, time, count));
         }
         self.image_scale = image_scale;
     }
 
-    /// Predicts [`Self::whole`] for the rest of the recipe.
+    /// Predicts [`Self::rest_seconds`] for the rest of the recipe.
     fn predict(&self, trainer: &Trainer, upcoming: &[UpcomingStretch]) -> f64 {
-        let unit = self.unit.unwrap_or(1e-6 / rayon::current_num_threads() as f64);
+        let work_seconds = self.work_seconds.unwrap_or(1e-6 / rayon::current_num_threads() as f64);
         let mut growth = Growth {
             rate: self.growth_rate(trainer),
-            aim: self.aim,
+            target: self.target,
             image_scale: self.image_scale,
             time: trainer.clock.time,
             count: trainer.engine.len() as f64,
         };
         let (now, settled) = self.overdraw();
-        let (seen, power) = (self.overdraws.len() as f64, pairs_power(trainer));
+        let (seen, power) = (self.overdraws.len() as f64, pairs_exponent(trainer));
         let (mut sum, mut steps) = (0.0, seen);
         for stretch in upcoming {
             growth.advance(trainer, stretch);
@@ -197,7 +200,7 @@ impl Forecast {
             let pairs = overdraw * (growth.count / stretch.image_scale).powf(power);
             sum += stretch.duration * self.work(trainer, stretch, growth.count, pairs);
         }
-        unit * sum
+        work_seconds * sum
     }
 
     /// Recent mean of [`Self::overdraws`], and its predicted limit: random initial splats overlap, with five to twelve times the pairs
@@ -209,7 +212,7 @@ impl Forecast {
         };
         let seen = self.overdraws.len();
         let (now, halfway) = (mean(seen), mean(seen.div_ceil(2)));
-        (now, (2.0 * now - halfway).clamp(MIN_SETTLED * now, now))
+        (now, (2.0 * now - halfway).clamp(MIN_OVERDRAW_FRACTION * now, now))
     }
 
     /// Splats added per recipe step from now on: as in the last round, and more if `classic` has just begun. Before the first round
@@ -224,49 +227,51 @@ impl Forecast {
         if self.rate == 0.0 {
             return trainer.engine.len() as f64 / stage.steps as f64;
         }
-        let begins = matches!(stage.density, Some(DensityControl::Classic(_))) && self.rounds < FIRST_ROUNDS;
-        self.rate * if begins { FIRST_ROUNDS_GROW } else { 1.0 }
+        let begins = matches!(stage.density, Some(DensityControl::Classic(_))) && self.rounds < EARLY_ROUNDS;
+        self.rate * if begins { EARLY_GROWTH } else { 1.0 }
     }
 
     /// Work of a step on `count` splats with `pairs` pairs per pixel, microseconds.
     fn work(&self, trainer: &Trainer, step: &UpcomingStretch, count: f64, pairs: f64) -> f64 {
         if let (Represents::Field, Some(knobs)) = (trainer.recipe.stage[step.stage].represents, &trainer.recipe.field) {
-            return SAMPLE * knobs.samples as f64;
+            return SAMPLE_COST * knobs.samples as f64;
         }
         let pixels = self.pixels * step.image_scale.powi(2);
-        let parameters = GEOMETRY + 3.0 * (step.sh_degree + 1.0).powi(2);
+        let parameters = GEOMETRY_PARAMETERS + 3.0 * (step.sh_degree + 1.0).powi(2);
         let perceptual = if step.perceptual && trainer.options.lpips.is_some() {
-            PERCEPTUAL_PIXEL * pixels.min(crate::objective::PATCH.pow(2) as f64)
+            PERCEPTUAL_PIXEL_COST * pixels.min(crate::objective::CROP_SIDE.pow(2) as f64)
         } else {
             0.0
         };
-        pixels * (PIXEL + PAIR * pairs) + count.max(1.0) * (SPLAT + PARAMETER * parameters) + perceptual
+        pixels * (PIXEL_COST + PAIR_COST * pairs)
+            + count.max(1.0) * (SPLAT_COST + PARAMETER_COST * parameters)
+            + perceptual
     }
 
     /// Seconds that the rest of the run takes at its current pace.
     pub fn seconds_left(&self, trainer: &Trainer) -> f64 {
-        (self.whole / trainer.pace - (trainer.seconds - self.seconds)).max(0.0)
+        (self.rest_seconds / trainer.pace - (trainer.seconds - self.seconds)).max(0.0)
     }
 
     /// The pace at which the rest of the run takes `seconds`.
     pub fn pace(&self, trainer: &Trainer, seconds: f64) -> f64 {
         let left = trainer.recipe.total_steps() as f64 - trainer.clock.time;
         // At least one more step, even without time left.
-        (self.whole / seconds.max(1e-6)).min(left)
+        (self.rest_seconds / seconds.max(1e-6)).min(left)
     }
 }
 
 /// Number of recent steps to average over.
 fn window(steps: usize) -> usize {
-    (steps / 4).clamp(1, WINDOW)
+    (steps / 4).clamp(1, MAX_WINDOW)
 }
 
-fn pairs_power(trainer: &Trainer) -> f64 {
+fn pairs_exponent(trainer: &Trainer) -> f64 {
     let copies = |density: &Option<DensityControl>| matches!(density, Some(DensityControl::Mcmc(_)));
     if trainer.recipe.stage.iter().any(|stage| copies(&stage.density)) {
-        MCMC_PAIRS_POWER
+        MCMC_PAIRS_EXPONENT
     } else {
-        PAIRS_POWER
+        PAIRS_EXPONENT
     }
 }
 
@@ -274,7 +279,7 @@ fn pairs_power(trainer: &Trainer) -> f64 {
 struct Growth {
     /// [`Forecast::growth_rate`].
     rate: f64,
-    aim: Option<Aim>,
+    target: Option<TargetCount>,
     image_scale: f64,
     time: f64,
     count: f64,
@@ -298,18 +303,18 @@ impl Growth {
             Some(DensityControl::Fast(_)) => {
                 let factor = stretch.image_scale / self.image_scale;
                 if factor > 1.0 {
-                    self.aim = Some(Aim::new(trainer, factor, self.time, self.count));
+                    self.target = Some(TargetCount::new(trainer, factor, self.time, self.count));
                 }
-                match self.aim {
+                match self.target {
                     None => self.count + self.rate * stretch.duration,
-                    Some(aim) if self.time < aim.until && self.count < aim.count => {
-                        (self.count + aim.rate * stretch.duration).min(aim.count)
+                    Some(target) if self.time < target.until && self.count < target.count => {
+                        (self.count + target.rate * stretch.duration).min(target.count)
                     }
                     Some(_) => self.count,
                 }
             }
             Some(DensityControl::Classic(_)) => {
-                let fades = GROWTH_FADES * trainer.pace;
+                let fades = GROWTH_DECAY_STEPS * trainer.pace;
                 let left = (-stretch.duration / fades).exp();
                 let added = self.rate * fades * (1.0 - left);
                 self.rate *= left;

@@ -8,17 +8,17 @@ use irradia_splat::SplatState;
 use rayon::prelude::*;
 
 /// Minimum number of points that a view sees for its nearest depth to be known.
-const ENOUGH_POINTS: usize = 20;
+const MIN_POINTS: usize = 20;
 /// The fraction of a view's points that may be closer than its nearest depth: wrong matches are in front of the surface too.
-const OUTLIERS: f64 = 0.02;
+const MAX_OUTLIER_FRACTION: f64 = 0.02;
 /// The fraction of all points that may lie in a sphere.
-const STRAY: f64 = 0.001;
+const MAX_STRAY_FRACTION: f64 = 0.001;
 /// Minimum number of views that see a point for it to be certain. Held-out PSNR without support and with that of points seen by 3 and 6: a
 /// plant in a room, with some photographs taken from among its leaves, 23.25, 23.54, 23.38 dB; mouse, whose table has wrong points, 24.23,
 /// 23.82, 24.23; lund_door and maryRose the same.
-const WITNESSES: u32 = 6;
+const MIN_WITNESSES: u32 = 6;
 /// Distance from such a point, relative to its distance from the camera, up to which splats may belong to the same surface.
-const SUPPORT: f32 = 0.15;
+const SUPPORT_RATIO: f32 = 0.15;
 
 /// A sphere around each training camera whose nearest depth is known.
 #[derive(Clone, Debug, Default)]
@@ -57,7 +57,9 @@ impl FreeSpace {
                 radius = radius.min(distance_to_points(points, view));
             }
             let center = view.camera.pose.position;
-            let near = certain.iter().map(|point| (*point, SUPPORT * point.distance(center)));
+            let near = certain
+                .iter()
+                .map(|point| (*point, SUPPORT_RATIO * point.distance(center)));
             Some(Sphere {
                 center,
                 radius,
@@ -105,7 +107,7 @@ fn certain_points(dataset: &Dataset) -> Vec<Vec3> {
             *count += 1;
         }
     }
-    let certain = |(position, count): (&Vec3, u32)| (count >= WITNESSES).then_some(*position);
+    let certain = |(position, count): (&Vec3, u32)| (count >= MIN_WITNESSES).then_some(*position);
     positions.iter().zip(witnesses).filter_map(certain).collect()
 }
 
@@ -113,7 +115,7 @@ fn certain_points(dataset: &Dataset) -> Vec<Vec3> {
 fn distance_to_points(points: &PointCloud, view: &View) -> f32 {
     let eye = view.camera.pose.position;
     let mut distances: Vec<f32> = points.positions.iter().map(|p| p.distance(eye)).collect();
-    let at = (distances.len() as f64 * STRAY) as usize;
+    let at = (distances.len() as f64 * MAX_STRAY_FRACTION) as usize;
     match distances.is_empty() {
         true => f32::INFINITY,
         false => *distances.select_nth_unstable_by(at, f32::total_cmp).1,
@@ -125,7 +127,7 @@ fn nearest_depth(dataset: &Dataset, view: &View) -> Option<f32> {
     let Some(mut depths) = seen_depths(dataset, view) else {
         return view.depth_bounds.map(|bounds| bounds[0]);
     };
-    let at = (depths.len() as f64 * OUTLIERS) as usize;
+    let at = (depths.len() as f64 * MAX_OUTLIER_FRACTION) as usize;
     Some(*depths.select_nth_unstable_by(at, f32::total_cmp).1)
 }
 
@@ -137,7 +139,7 @@ pub(crate) fn seen_depths(dataset: &Dataset, view: &View) -> Option<Vec<f32>> {
         .map(|position| view.camera.pose.camera_from_world(*position).z)
         .filter(|depth| *depth > view.camera.near)
         .collect();
-    (depths.len() >= ENOUGH_POINTS).then_some(depths)
+    (depths.len() >= MIN_POINTS).then_some(depths)
 }
 
 #[cfg(test)]

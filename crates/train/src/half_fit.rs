@@ -21,9 +21,9 @@ pub struct HalfFit {
 }
 
 /// Gradient steps of the pose: the first half at half resolution.
-const STEPS: usize = 100;
+const POSE_STEPS: usize = 100;
 /// Initial and final learning rate, in radians and in units of the scene's extent.
-const RATES: [f32; 2] = [1e-3, 1e-5];
+const POSE_RATES: [f32; 2] = [1e-3, 1e-5];
 
 impl HalfFit {
     /// Whether anything is fitted.
@@ -116,8 +116,8 @@ fn fitted_pose(model: &Model, renderer: &mut Renderer, view: &HeldOut, fit: Half
         let truth = Image::new(target.width, target.height, 3, data);
         (intrinsics, truth, target.mask)
     });
-    for step in 0..STEPS {
-        let (intrinsics, truth, mask) = &targets[usize::from(2 * step >= STEPS)];
+    for step in 0..POSE_STEPS {
+        let (intrinsics, truth, mask) = &targets[usize::from(2 * step >= POSE_STEPS)];
         camera.intrinsics = *intrinsics;
         let width = intrinsics.width;
         let counts = |i: usize| is_left(i, width as usize) && mask.as_ref().is_none_or(|mask| mask[i] != 0);
@@ -134,8 +134,8 @@ fn fitted_pose(model: &Model, renderer: &mut Renderer, view: &HeldOut, fit: Half
         };
         renderer.backward(splats, &v_out, &mut gradients);
         let gradient = gradients.camera.unwrap_or_default();
-        let passed = step as f32 / STEPS as f32;
-        let rate = RATES[0] * (RATES[1] / RATES[0]).powf(passed);
+        let passed = step as f32 / POSE_STEPS as f32;
+        let rate = POSE_RATES[0] * (POSE_RATES[1] / POSE_RATES[0]).powf(passed);
         let shift = rate * extent;
         let v = tangent_gradient(&camera, &gradient);
         let change = adam.step(0, v, [rate, rate, rate, shift, shift, shift]);

@@ -27,7 +27,7 @@ pub struct Light<'a> {
 impl Lights {
     /// The lights of a training; `None` if it has not learned any.
     pub fn of_training(sockets: &Sockets) -> Option<Self> {
-        let appearance = sockets.appearance.as_ref().and_then(Appearance::learnt).cloned();
+        let appearance = sockets.appearance.as_ref().and_then(Appearance::trained_field).cloned();
         let lights = Self {
             exposures: sockets.exposure.clone(),
             appearance,
@@ -172,7 +172,7 @@ mod tests {
             assert!(Lights::from_files(None, Some(bytes)).is_err());
         }
         let other = crate::tensor_file::to_bytes(
-            &[crate::tensor_file::NamedTensor::real("maps", vec![5], &[0.0; 5])],
+            &[crate::tensor_file::NamedTensor::f32s("maps", vec![5], &[0.0; 5])],
             ("x", "1".into()),
         );
         let error = Lights::from_files(Some(&other), None).unwrap_err().to_string();

@@ -3,7 +3,7 @@
 //! Constants are bytes per splat or pixel at the peak, from the sizes of the arrays, and checked against the peak memory of runs
 //! (RESULTS.md, "How much memory does a training need?").
 
-use crate::field_step::{ALL_PHOTOS, PHOTO_PIXEL, is_field};
+use crate::field_step::{BYTES_PER_PHOTO_PIXEL, MAX_PHOTO_BYTES, is_field};
 use crate::recipe::Recipe;
 use crate::trainer::TrainError;
 use irradia_measure::LpipsNet;
@@ -12,33 +12,34 @@ use std::fmt;
 use std::fs;
 
 /// Parameters, gradients and two moments are 59 values each; with statistics, filter, activity and screen gradients.
-const STATE: usize = 4 * (4 * 59 + 5 + 1 + 1 + 4);
+const STATE_BYTES: usize = 4 * (4 * 59 + 5 + 1 + 1 + 4);
 /// Footprint, depth key and orders of a frame.
-const FOOTPRINT: usize = 96;
+const FOOTPRINT_BYTES: usize = 96;
 /// An intersection of a splat and a tile: index, blocks, position and the sums of its gradients.
-const INTERSECTION: usize = 64;
+const INTERSECTION_BYTES: usize = 64;
 /// Intersections per splat: most splats are out of view or within one or two tiles.
-const INTERSECTIONS: usize = 3;
+const INTERSECTIONS_PER_SPLAT: usize = 3;
 /// A copy of parameters, moments and statistics, from which a checkpoint is written in the background.
-const SAVING: usize = 4 * (3 * 59 + 6);
+const SNAPSHOT_BYTES: usize = 4 * (3 * 59 + 6);
 /// A splat, in total.
-const SPLAT: usize = STATE + FOOTPRINT + INTERSECTIONS * INTERSECTION + SAVING;
+const SPLAT_BYTES: usize =
+    STATE_BYTES + FOOTPRINT_BYTES + INTERSECTIONS_PER_SPLAT * INTERSECTION_BYTES + SNAPSHOT_BYTES;
 /// A pixel of the largest photograph: frame, gradients, the maps of SSIM, and the intersections of a few thousand splats per tile.
-const PIXEL: usize = 300;
+const PIXEL_BYTES: usize = 300;
 /// The program with its threads.
-const PROGRAM: usize = 64 << 20;
+const PROGRAM_BYTES: usize = 64 << 20;
 /// A radiance field of a built-in recipe with its samples.
-const FIELD: usize = 512 << 20;
+const FIELD_BYTES: usize = 512 << 20;
 /// A point of the dataset.
-const POINT: usize = 15;
+const POINT_BYTES: usize = 15;
 /// Fraction of the memory, as a divisor, that photographs get before splats, if they need it.
-const PHOTO_SHARE: usize = 4;
+const PHOTO_DIVISOR: usize = 4;
 /// Minimum number of photographs in memory: with fewer, training would wait for each.
-const FEW_PHOTOS: usize = 8;
+const MIN_PHOTOS: usize = 8;
 /// Fraction of the memory for photographs, as a divisor, that held-out ones may take if the free memory is unknown.
-const HELD_OUT_SHARE: usize = 8;
+const HELD_OUT_DIVISOR: usize = 8;
 /// Memory for photographs if the free memory is unknown: 5,500 of 360 x 360.
-const UNKNOWN: usize = 2 << 30;
+const DEFAULT_PHOTO_BYTES: usize = 2 << 30;
 
 /// The distribution of the memory of a process, bytes.
 #[derive(Clone, Debug, PartialEq)]
@@ -76,7 +77,7 @@ pub(crate) struct Needs {
     /// Number of first splats.
     pub first_splats: usize,
     /// The recipe's limit for this dataset.
-    pub most_splats: usize,
+    pub max_splats: usize,
 }
 
 impl Needs {
@@ -91,30 +92,35 @@ impl Needs {
             .map(|view| dataset.views[*view].photo.working_bytes())
             .max()
             .unwrap_or(0);
-        let bytes = |views: &[usize]| views.iter().map(|view| PHOTO_PIXEL * pixels(view)).sum::<usize>();
+        let bytes = |views: &[usize]| {
+            views
+                .iter()
+                .map(|view| BYTES_PER_PHOTO_PIXEL * pixels(view))
+                .sum::<usize>()
+        };
         let all = bytes(&dataset.train);
         let has_field = (0..recipe.stage.len()).any(|stage| is_field(recipe, stage));
-        let all_at_once = has_field && all <= ALL_PHOTOS;
+        let all_at_once = has_field && all <= MAX_PHOTO_BYTES;
         let perceptual = match lpips {
             None => 0,
             Some(LpipsNet::Squeeze | LpipsNet::Alex) => 300,
             Some(LpipsNet::Vgg) => 3000,
         };
         Self {
-            program: PROGRAM
-                + dataset.points.as_ref().map_or(0, |points| POINT * points.len())
-                + if has_field { FIELD } else { 0 },
-            images: (PIXEL + perceptual) * largest,
+            program: PROGRAM_BYTES
+                + dataset.points.as_ref().map_or(0, |points| POINT_BYTES * points.len())
+                + if has_field { FIELD_BYTES } else { 0 },
+            images: (PIXEL_BYTES + perceptual) * largest,
             few_photos: working
                 + if all_at_once {
                     all
                 } else {
-                    all.min(FEW_PHOTOS * PHOTO_PIXEL * largest)
+                    all.min(MIN_PHOTOS * BYTES_PER_PHOTO_PIXEL * largest)
                 },
             all_photos: working + all,
             held_out: bytes(&dataset.test),
             first_splats: 0,
-            most_splats: 0,
+            max_splats: 0,
         }
     }
 }
@@ -133,19 +139,19 @@ impl MemoryPlan {
             all_photos: needs.all_photos,
             held_out,
             splats,
-            wanted_splats: needs.most_splats,
+            wanted_splats: needs.max_splats,
         };
         let Some(memory) = limit else {
-            let held_out = Some(needs.held_out).filter(|bytes| *bytes <= UNKNOWN / HELD_OUT_SHARE);
-            return Ok(plan(needs.most_splats, UNKNOWN, held_out.unwrap_or(0)));
+            let held_out = Some(needs.held_out).filter(|bytes| *bytes <= DEFAULT_PHOTO_BYTES / HELD_OUT_DIVISOR);
+            return Ok(plan(needs.max_splats, DEFAULT_PHOTO_BYTES, held_out.unwrap_or(0)));
         };
         let fixed = needs.program + needs.images;
-        let least = fixed + needs.few_photos + SPLAT * needs.first_splats.max(1);
-        if least > memory {
-            let fitting = memory.saturating_sub(fixed + needs.few_photos) / SPLAT;
+        let min_total = fixed + needs.few_photos + SPLAT_BYTES * needs.first_splats.max(1);
+        if min_total > memory {
+            let fitting = memory.saturating_sub(fixed + needs.few_photos) / SPLAT_BYTES;
             return Err(TrainError::Memory {
                 limit: in_gib(memory),
-                needed: in_gib_above(least),
+                needed: in_gib_rounded_up(min_total),
                 splats: needs.first_splats,
                 otherwise: if fitting >= 1000 {
                     format!(", or {fitting} splats with --max-splats")
@@ -156,10 +162,10 @@ impl MemoryPlan {
         }
         let photos = needs
             .all_photos
-            .min(needs.few_photos.max((memory - fixed) / PHOTO_SHARE));
-        let fitting = (memory - fixed).saturating_sub(photos) / SPLAT;
-        let splats = needs.most_splats.min(fitting.max(needs.first_splats)).max(1);
-        let rest = memory - fixed - SPLAT * splats;
+            .min(needs.few_photos.max((memory - fixed) / PHOTO_DIVISOR));
+        let fitting = (memory - fixed).saturating_sub(photos) / SPLAT_BYTES;
+        let splats = needs.max_splats.min(fitting.max(needs.first_splats)).max(1);
+        let rest = memory - fixed - SPLAT_BYTES * splats;
         let held_out = Some(needs.held_out).filter(|bytes| photos + bytes <= rest).unwrap_or(0);
         // Photographs at full size, and at the scale of a stage.
         Ok(plan(splats, (2 * needs.all_photos).min(rest - held_out), held_out))
@@ -168,11 +174,11 @@ impl MemoryPlan {
     /// The limit on the number of splats, given a frame of `pixels` pixels in which `splats` splats have `intersections` intersections with
     /// tiles; more of these than were reserved reduce the limit.
     pub(crate) fn splats_at(&self, intersections: usize, splats: usize, pixels: usize) -> usize {
-        let reserved = INTERSECTIONS * splats + pixels / 10;
-        let excess = INTERSECTION * intersections.saturating_sub(reserved);
+        let reserved = INTERSECTIONS_PER_SPLAT * splats + pixels / 10;
+        let excess = INTERSECTION_BYTES * intersections.saturating_sub(reserved);
         match self.limit {
             // Intersections grow with splats, and other views may have more.
-            Some(_) => self.splats.saturating_sub(2 * excess / SPLAT).max(1),
+            Some(_) => self.splats.saturating_sub(2 * excess / SPLAT_BYTES).max(1),
             None => usize::MAX,
         }
     }
@@ -180,13 +186,13 @@ impl MemoryPlan {
     /// A warning, one line, if memory limits the splats of the recipe `name`.
     pub(crate) fn warning(&self, name: &str) -> Option<String> {
         let limit = self.limit.filter(|_| self.splats < self.wanted_splats)?;
-        let more = SPLAT * (self.wanted_splats - self.splats);
+        let more = SPLAT_BYTES * (self.wanted_splats - self.splats);
         Some(format!(
             "{} of memory allows {} splats, but recipe {name} has up to {}: density control adds fewer; --memory {} allows all",
             in_gib(limit),
             self.splats,
             self.wanted_splats,
-            in_gib_above(limit + more)
+            in_gib_rounded_up(limit + more)
         ))
     }
 }
@@ -198,7 +204,12 @@ impl fmt::Display for MemoryPlan {
         };
         write!(f, "memory: at most {}: ", in_gib(limit))?;
         if self.wanted_splats > 0 {
-            write!(f, "{} for up to {} splats, ", in_gib(SPLAT * self.splats), self.splats)?;
+            write!(
+                f,
+                "{} for up to {} splats, ",
+                in_gib(SPLAT_BYTES * self.splats),
+                self.splats
+            )?;
         }
         write!(
             f,
@@ -216,12 +227,12 @@ fn in_gib(bytes: usize) -> String {
 }
 
 /// As `--memory` reads it; rounded up, so that the figure suffices.
-fn in_gib_above(bytes: usize) -> String {
+fn in_gib_rounded_up(bytes: usize) -> String {
     in_gib(bytes + (1 << 30) / 100).replace(' ', "")
 }
 
 /// Three quarters of the free memory, bytes; `None` where unknown.
-pub fn usual_limit() -> Option<usize> {
+pub fn default_limit() -> Option<usize> {
     Some(free()? / 4 * 3)
 }
 
@@ -237,8 +248,8 @@ pub fn free() -> Option<usize> {
     let cached = || inactive_files(&read("/sys/fs/cgroup/memory.stat")?);
     let group = number("/sys/fs/cgroup/memory.max")
         .zip(number("/sys/fs/cgroup/memory.current"))
-        .map_or(u64::MAX, |(most, used)| {
-            most.saturating_sub(used.saturating_sub(cached().unwrap_or(0)))
+        .map_or(u64::MAX, |(limit, used)| {
+            limit.saturating_sub(used.saturating_sub(cached().unwrap_or(0)))
         });
     usize::try_from(system.min(group)).ok()
 }
@@ -265,15 +276,15 @@ mod tests {
 
     const GIB: usize = 1 << 30;
 
-    fn needs(first_splats: usize, most_splats: usize) -> Needs {
+    fn needs(first_splats: usize, max_splats: usize) -> Needs {
         Needs {
-            program: PROGRAM,
-            images: PIXEL * 1_000_000,
+            program: PROGRAM_BYTES,
+            images: PIXEL_BYTES * 1_000_000,
             few_photos: 50 << 20,
             all_photos: 10 * GIB,
             held_out: GIB,
             first_splats,
-            most_splats,
+            max_splats,
         }
     }
 
@@ -283,7 +294,7 @@ mod tests {
             for first in [0, 200_000, 1_000_000, 5_000_000] {
                 match MemoryPlan::new(&needs(first, 6_000_000), Some(limit)) {
                     Ok(plan) => {
-                        let used = plan.program + plan.images + plan.photos + plan.held_out + SPLAT * plan.splats;
+                        let used = plan.program + plan.images + plan.photos + plan.held_out + SPLAT_BYTES * plan.splats;
                         assert!(used <= limit && plan.splats >= first && plan.photos >= 50 << 20);
                         assert!([0, GIB].contains(&plan.held_out) && (limit < 32 * GIB || plan.held_out > 0));
                     }
@@ -330,6 +341,6 @@ mod tests {
     #[test]
     #[cfg(target_os = "linux")]
     fn the_free_memory_is_known() {
-        assert!(usual_limit().unwrap() > 1 << 26);
+        assert!(default_limit().unwrap() > 1 << 26);
     }
 }

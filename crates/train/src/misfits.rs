@@ -3,7 +3,7 @@
 //! After the first fifth of a run the splats show what most photographs have in common, and have not yet adapted to the others. A
 //! photograph whose error is far beyond the usual spread of errors is then left out: what splats would do to fit it, in the place that it
 //! shows or elsewhere, harms every other view. Natural differences of errors (texture, depth of field, views at the border of the scene)
-//! stay below [`FACTOR`], or widen the spread.
+//! stay below [`MIN_FACTOR`], or widen the spread.
 
 use crate::event::Event;
 use crate::robust::{median, spread};
@@ -13,13 +13,13 @@ use crate::trainer::Trainer;
 const MIN_VIEWS: usize = 8;
 /// Number of standard deviations of the ln errors above their median beyond which a photograph is a misfit: five wrong poses of fifty were
 /// at 7 to 9 (of the ln squared errors), the most unusual photographs of seven captures at 1.2 to 4.
-const DEVIATIONS: f64 = 5.0;
+const MIN_DEVIATIONS: f64 = 5.0;
 /// Minimum factor of a misfit's error over the median: the wrong poses had 3.5 to 5.4, and a photograph with a correct pose has had 2.1.
-const FACTOR: f64 = 2.5;
+const MIN_FACTOR: f64 = 2.5;
 /// Minimum factor over the median of a misfit's error over the pixels that fit best.
-const TRIMMED_FACTOR: f64 = 1.5;
+const MIN_TRIMMED_FACTOR: f64 = 1.5;
 /// Maximum fraction of misfits: with more of them it is not clear which photographs are wrong.
-const MOST: f64 = 0.2;
+const MAX_MISFIT_FRACTION: f64 = 0.2;
 
 /// The views whose `errors` are far beyond the others' spread, and the factors of these over the median, worst first.
 fn outliers(errors: &[(usize, f64)]) -> Vec<(usize, f64)> {
@@ -28,11 +28,11 @@ fn outliers(errors: &[(usize, f64)]) -> Vec<(usize, f64)> {
         return Vec::new();
     }
     let middle = median(logs.clone());
-    let least = (DEVIATIONS * spread(logs.iter().map(|log| log - middle))).max(FACTOR.ln());
+    let threshold = (MIN_DEVIATIONS * spread(logs.iter().map(|log| log - middle))).max(MIN_FACTOR.ln());
     let excess = errors
         .iter()
         .map(|(view, error)| (*view, error.max(1e-9).ln() - middle));
-    let mut found: Vec<(usize, f64)> = excess.filter(|(_, excess)| *excess > least).collect();
+    let mut found: Vec<(usize, f64)> = excess.filter(|(_, excess)| *excess > threshold).collect();
     found.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
     found.iter().map(|(view, excess)| (*view, excess.exp())).collect()
 }
@@ -43,8 +43,12 @@ fn misfits(errors: &[(usize, [f64; 2])]) -> Vec<(usize, f64)> {
     let all: Vec<(usize, f64)> = errors.iter().map(|(view, [all, _])| (*view, *all)).collect();
     let mut found = outliers(&all);
     if !found.is_empty() {
-        let least = TRIMMED_FACTOR * median(errors.iter().map(|(_, [_, best])| *best).collect());
-        found.retain(|(misfit, _)| errors.iter().any(|(view, [_, best])| view == misfit && *best > least));
+        let threshold = MIN_TRIMMED_FACTOR * median(errors.iter().map(|(_, [_, best])| *best).collect());
+        found.retain(|(misfit, _)| {
+            errors
+                .iter()
+                .any(|(view, [_, best])| view == misfit && *best > threshold)
+        });
     }
     found
 }
@@ -61,7 +65,7 @@ impl Trainer {
             .map(|(view, factor)| format!("{} ({factor:.1} times the usual error)", self.dataset.views[*view].name))
             .collect();
         let (names, n, count) = (names.join(", "), found.len(), errors.len());
-        let message = if n as f64 > MOST * count as f64 {
+        let message = if n as f64 > MAX_MISFIT_FRACTION * count as f64 {
             format!(
                 "{n} of {count} photographs do not fit the others, too many to leave out; are their poses right? {names}"
             )

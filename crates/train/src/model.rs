@@ -80,7 +80,7 @@ impl Frame {
 }
 
 /// The options of a field.
-pub(crate) fn of_field(options: &RenderOptions) -> irradia_field::RenderOptions {
+pub(crate) fn field_options(options: &RenderOptions) -> irradia_field::RenderOptions {
     irradia_field::RenderOptions {
         background: options.background,
         image: None,
@@ -113,7 +113,7 @@ impl<'a> Model<'a> {
                 Frame::of_planes(renderer.frame(), camera)
             }
             Model::Field(field) => {
-                let view = render_view(field, camera, &of_field(options));
+                let view = render_view(field, camera, &field_options(options));
                 Frame::of_view(view, camera)
             }
         }

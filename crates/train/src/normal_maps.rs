@@ -12,17 +12,17 @@ use irradia_scene::{Camera, Dataset, NormalGrid};
 use rayon::prelude::*;
 
 /// Minimum length of a known normal.
-const KNOWN: f32 = 0.5;
+const MIN_LENGTH: f32 = 0.5;
 /// Minimum fraction of the normals that face the cameras.
-const FACING: f64 = 0.9;
+const MIN_FACING_FRACTION: f64 = 0.9;
 /// Difference up to which two such fractions count as equal.
-const EQUAL: f64 = 0.01;
+const FRACTION_TOLERANCE: f64 = 0.01;
 
 /// The maps of a dataset's training views, in their cameras' axes (x right, y down, z forward).
 #[derive(Default)]
 pub(crate) struct NormalMaps {
     /// By view.
-    of: Vec<Option<NormalGrid>>,
+    by_view: Vec<Option<NormalGrid>>,
     /// What was found, one line.
     pub summary: String,
 }
@@ -48,7 +48,7 @@ impl Axes {
             Self::OpenGl => Vec3::new(normal.x, -normal.y, -normal.z),
             Self::World => camera.pose.rotation.inverse() * normal,
         };
-        (normal.length() >= KNOWN).then(|| turned.normalize())
+        (normal.length() >= MIN_LENGTH).then(|| turned.normalize())
     }
 
     fn name(self) -> &'static str {
@@ -79,14 +79,20 @@ impl NormalMaps {
             .find_map(|(_, map)| map.as_ref().err())
             .map(|error| format!("; {error}"));
         let mut maps: Vec<(usize, NormalGrid)> = maps.into_iter().filter_map(|(i, map)| Some((i, map.ok()?))).collect();
-        let shares = Axes::ALL.map(|axes| (axes, facing(dataset, &maps, axes)));
+        let shares = Axes::ALL.map(|axes| (axes, facing_fraction(dataset, &maps, axes)));
         // The first of equal ones: normals in a camera's axes may well face it if they are taken for the world's, but hardly the reverse.
         let (axes, share) = shares
             .into_iter()
-            .reduce(|best, next| if next.1 > best.1 + EQUAL { next } else { best })
+            .reduce(|best, next| {
+                if next.1 > best.1 + FRACTION_TOLERANCE {
+                    next
+                } else {
+                    best
+                }
+            })
             .expect("there are axes");
-        let mut of: Vec<Option<NormalGrid>> = dataset.views.iter().map(|_| None).collect();
-        if share >= FACING {
+        let mut by_view: Vec<Option<NormalGrid>> = dataset.views.iter().map(|_| None).collect();
+        if share >= MIN_FACING_FRACTION {
             for (view, map) in &mut maps {
                 let camera = &dataset.views[*view].camera;
                 for normal in &mut map.values {
@@ -94,11 +100,11 @@ impl NormalMaps {
                 }
             }
             for (view, map) in maps {
-                of[view] = Some(map);
+                by_view[view] = Some(map);
             }
         }
-        let used = of.iter().flatten().count();
-        let found = match share >= FACING {
+        let used = by_view.iter().flatten().count();
+        let found = match share >= MIN_FACING_FRACTION {
             true => axes.name().to_owned(),
             false => format!(
                 "at most {:.0} % of their normals face the cameras in any known axes",
@@ -106,7 +112,7 @@ impl NormalMaps {
             ),
         };
         Self {
-            of,
+            by_view,
             summary: format!(
                 "{used} of {given} given maps of normals are used ({found}){}",
                 unreadable.unwrap_or_default()
@@ -116,12 +122,12 @@ impl NormalMaps {
 
     /// Whether no map can be used.
     pub fn is_empty(&self) -> bool {
-        self.of.iter().all(Option::is_none)
+        self.by_view.iter().all(Option::is_none)
     }
 
     /// The normals of `view` at the pixels of `camera`, and half of their spacing, pixels.
     pub fn samples(&self, view: usize, camera: &Camera) -> Option<(Vec<NormalSample>, u32)> {
-        let grid = self.of.get(view)?.as_ref()?;
+        let grid = self.by_view.get(view)?.as_ref()?;
         let k = &camera.intrinsics;
         let known = grid
             .pixels(k.width, k.height)
@@ -132,7 +138,7 @@ impl NormalMaps {
 }
 
 /// The fraction of the normals of `maps` that face their cameras if they are in `axes`.
-fn facing(dataset: &Dataset, maps: &[(usize, NormalGrid)], axes: Axes) -> f64 {
+fn facing_fraction(dataset: &Dataset, maps: &[(usize, NormalGrid)], axes: Axes) -> f64 {
     let (mut facing, mut known) = (0usize, 0usize);
     for (view, map) in maps {
         let camera = &dataset.views[*view].camera;

@@ -14,10 +14,10 @@ use rayon::prelude::*;
 use std::sync::Arc;
 
 /// Side of the random LPIPS crop of a step, pixels.
-pub(crate) const PATCH: usize = 128;
+pub(crate) const CROP_SIDE: usize = 128;
 /// Fraction of the pixels, those that fit best, by which photographs are compared: a person in front of the camera makes only the other
 /// pixels worse, a wrong pose makes all of them worse.
-const TRIMMED: f32 = 0.7;
+const TRIMMED_FRACTION: f32 = 0.7;
 /// Edge sensitivity of depth smoothness: a colour edge of 0.1 reduces it to 1 / e (Godard et al. 2017 use 1 for colours normalised
 /// differently).
 const EDGE_SHARPNESS: f32 = 10.0;
@@ -37,12 +37,12 @@ pub struct Objective {
     v_depth: Vec<f32>,
     error: Vec<f32>,
     edges: Vec<f32>,
-    has: Has,
+    present: PresentGradients,
 }
 
 /// Which gradients the last frame has.
 #[derive(Clone, Copy, Default)]
-struct Has {
+struct PresentGradients {
     alpha: bool,
     depth: bool,
 }
@@ -87,7 +87,7 @@ impl Objective {
             v_depth: Vec::new(),
             error: Vec::new(),
             edges: Vec::new(),
-            has: Has::default(),
+            present: PresentGradients::default(),
         }
     }
 
@@ -128,7 +128,7 @@ impl Objective {
         }
         let weight = plan.value(Param::PerceptualWeight);
         if let Some(lpips) = self.lpips.as_ref().filter(|_| weight > 0.0) {
-            let crop = Crop::random(width, height, PATCH, rng);
+            let crop = Crop::random(width, height, CROP_SIDE, rng);
             // Images too small for the network are skipped.
             if let Ok(loss) = perceptual(lpips, color, &target, crop, weight, &mut self.v_color) {
                 total += f64::from(weight) * loss;
@@ -139,11 +139,11 @@ impl Objective {
         let [alpha, mask] =
             maps.map(|(param, map)| Some((plan.value(param), map.as_ref()?)).filter(|(weight, _)| *weight > 0.0));
         let cover = cover_weight(photo, plan);
-        self.has = Has {
+        self.present = PresentGradients {
             depth: depths,
             alpha: depths || cover > 0.0 || alpha.is_some() || mask.is_some(),
         };
-        if self.has.alpha {
+        if self.present.alpha {
             clear(&mut self.v_alpha, pixels);
         }
         if cover > 0.0 {
@@ -158,10 +158,10 @@ impl Objective {
             }
         }
         if let Some((weight, wanted)) = alpha {
-            total += compare_alpha(frame.alpha, wanted, weight, &mut self.v_alpha);
+            total += alpha_loss(frame.alpha, wanted, weight, &mut self.v_alpha);
         }
         if let Some((weight, mask)) = mask {
-            total += clear_masked(frame.alpha, mask, weight, &mut self.v_alpha);
+            total += masked_alpha_loss(frame.alpha, mask, weight, &mut self.v_alpha);
         }
         if depths {
             clear(&mut self.v_depth, pixels);
@@ -242,14 +242,14 @@ impl Objective {
     }
 
     /// The mean of the result of [`Objective::error`] over the pixels of `photo` that are neither masked nor transparent, and over the
-    /// fraction [`TRIMMED`] of them that fits best; 0 if there are none.
+    /// fraction [`TRIMMED_FRACTION`] of them that fits best; 0 if there are none.
     pub fn mean_errors(&self, photo: &Prepared) -> [f64; 2] {
-        let shown = |plane: &Option<Vec<u8>>, at: usize| plane.as_ref().is_none_or(|values| values[at] != 0);
-        let counts = |at: &usize| shown(&photo.mask, *at) && shown(&photo.alpha, *at);
+        let is_set = |plane: &Option<Vec<u8>>, at: usize| plane.as_ref().is_none_or(|values| values[at] != 0);
+        let counts = |at: &usize| is_set(&photo.mask, *at) && is_set(&photo.alpha, *at);
         let mut errors: Vec<f32> = (0..self.error.len()).filter(counts).map(|at| self.error[at]).collect();
         let mean = |errors: &[f32]| errors.iter().map(|e| f64::from(*e)).sum::<f64>() / errors.len().max(1) as f64;
         let all = mean(&errors);
-        let best = (errors.len() as f32 * TRIMMED) as usize;
+        let best = (errors.len() as f32 * TRIMMED_FRACTION) as usize;
         if best < errors.len() {
             errors.select_nth_unstable_by(best, f32::total_cmp);
         }
@@ -263,8 +263,8 @@ impl Objective {
 
     /// The gradient of the colour last evaluated, `[3, H, W]`, and that of the coverage, `[H, W]`, for the caller to add to.
     pub fn v_color_and_alpha(&mut self) -> (&[f32], &mut [f32]) {
-        if !self.has.alpha {
-            self.has.alpha = true;
+        if !self.present.alpha {
+            self.present.alpha = true;
             clear(&mut self.v_alpha, self.v_color.len() / 3);
         }
         (&self.v_color, &mut self.v_alpha)
@@ -273,8 +273,8 @@ impl Objective {
     /// The gradients of the frame last evaluated; `gather` and `camera` are left for the caller to set.
     pub fn gradient(&self) -> OutputGradient<'_> {
         OutputGradient {
-            alpha: self.has.alpha.then_some(&self.v_alpha[..]),
-            depth: self.has.depth.then_some(&self.v_depth[..]),
+            alpha: self.present.alpha.then_some(&self.v_alpha[..]),
+            depth: self.present.depth.then_some(&self.v_depth[..]),
             ..OutputGradient::of_color(&self.v_color)
         }
     }
@@ -309,7 +309,7 @@ pub(crate) fn cover_weight(photo: &Prepared, plan: &StepPlan) -> f32 {
 }
 
 /// Mean |got - want|, weighted; adds its gradient to `v_alpha`.
-fn compare_alpha(got: &[f32], want: &[u8], weight: f32, v_alpha: &mut [f32]) -> f64 {
+fn alpha_loss(got: &[f32], want: &[u8], weight: f32, v_alpha: &mut [f32]) -> f64 {
     let weight = weight / got.len() as f32;
     let mut sum = 0.0f64;
     for ((v, got), want) in v_alpha.iter_mut().zip(got).zip(want) {
@@ -325,7 +325,7 @@ fn compare_alpha(got: &[f32], want: &[u8], weight: f32, v_alpha: &mut [f32]) -> 
 /// Sum of alpha over the pixels that `mask` leaves out, divided by the number of all pixels, weighted; adds its gradient to `v_alpha`.
 /// Pixels that the mask keeps have no target: outlines of masks are rarely exact, and what they keep next to an object may be empty as
 /// well.
-fn clear_masked(alpha: &[f32], mask: &[u8], weight: f32, v_alpha: &mut [f32]) -> f64 {
+fn masked_alpha_loss(alpha: &[f32], mask: &[u8], weight: f32, v_alpha: &mut [f32]) -> f64 {
     let weight = weight / alpha.len() as f32;
     let mut sum = 0.0f64;
     for ((v, alpha), _) in v_alpha.iter_mut().zip(alpha).zip(mask).filter(|(_, mask)| **mask == 0) {

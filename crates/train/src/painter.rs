@@ -1,7 +1,7 @@
 //! Renders one model repeatedly.
 
 #[cfg(feature = "gpu")]
-use crate::model::of_field;
+use crate::model::field_options;
 use crate::model::{Frame, Model, RenderOptions};
 use irradia_compute::{Device, DeviceError};
 use irradia_scene::Camera;
@@ -56,7 +56,10 @@ impl<'m> Painter<'m> {
                 return Ok(frame);
             }
             (Some(OnGpu::Field(gpu)), Model::Field(field)) => {
-                return Ok(Frame::of_view(gpu.render(field, camera, &of_field(options))?, camera));
+                return Ok(Frame::of_view(
+                    gpu.render(field, camera, &field_options(options))?,
+                    camera,
+                ));
             }
             _ => {}
         }

@@ -9,9 +9,9 @@ use std::sync::Arc;
 use std::time::Instant;
 
 /// Number of photographs loaded ahead per loading thread if not all fit into the budget: enough to bridge a few slow ones.
-const AHEAD: usize = 8;
+const PREFETCH_PER_THREAD: usize = 8;
 /// Fraction of the budget, as a divisor, that photographs being decoded may use.
-const WORKING_SHARE: usize = 4;
+const DECODING_DIVISOR: usize = 4;
 
 /// A photograph ready for the loss.
 #[derive(Clone, Debug)]
@@ -61,14 +61,14 @@ impl Prepared {
 
 /// The parts of a photograph that are in memory.
 #[derive(Default)]
-struct Held {
+struct CachedPhoto {
     /// At the current scale.
     prepared: Option<Arc<Prepared>>,
     /// At full size, from which other scales are made.
     full: Option<Arc<Photo>>,
 }
 
-impl Held {
+impl CachedPhoto {
     fn bytes(&self) -> usize {
         self.prepared.as_ref().map_or(0, |photo| photo.bytes()) + self.full.as_ref().map_or(0, |photo| photo.bytes())
     }
@@ -80,14 +80,14 @@ impl Held {
 pub struct PhotoCache {
     dataset: Arc<Dataset>,
     budget: usize,
-    held: HashMap<usize, Held>,
+    cached: HashMap<usize, CachedPhoto>,
     bytes: usize,
     /// Size relative to the data's.
     scale: f32,
     /// Whether all training photographs fit.
     fits: bool,
     /// Whether all of them were loaded once.
-    all_seen: bool,
+    all_loaded: bool,
     /// Whether they also fit at full size, in addition to those at `scale`.
     keeps_full: bool,
     threads: usize,
@@ -107,17 +107,17 @@ impl PhotoCache {
             .map(|view| view.photo.working_bytes())
             .max()
             .unwrap_or(0);
-        let most = budget / WORKING_SHARE / working.max(1);
-        let threads = rayon::current_num_threads().min(most).max(1);
+        let max_threads = budget / DECODING_DIVISOR / working.max(1);
+        let threads = rayon::current_num_threads().min(max_threads).max(1);
         let mut cache = Self {
             loader: Loader::new(dataset.clone(), background, threads),
             dataset,
             budget: budget.saturating_sub(threads * working),
-            held: HashMap::new(),
+            cached: HashMap::new(),
             bytes: 0,
             scale: 1.0,
             fits: false,
-            all_seen: false,
+            all_loaded: false,
             keeps_full: false,
             threads,
             ahead: 1,
@@ -142,23 +142,23 @@ impl PhotoCache {
         if scale != self.scale {
             self.use_scale(scale);
         }
-        self.keep(false)?;
+        self.store_loaded(false)?;
         self.load_ahead(upcoming);
         let started = Instant::now();
-        let mut all = self.fits && !self.all_seen && upcoming.len() == self.dataset.train.len();
+        let mut all = self.fits && !self.all_loaded && upcoming.len() == self.dataset.train.len();
         loop {
             let needed = if all { upcoming } else { &upcoming[..1] };
-            if needed.iter().all(|view| self.is_there(view)) {
+            if needed.iter().all(|view| self.is_cached(view)) {
                 self.seconds += started.elapsed().as_secs_f64();
-                self.all_seen |= all;
-                return Ok(self.held[&upcoming[0]].prepared.clone().expect("it is there"));
+                self.all_loaded |= all;
+                return Ok(self.cached[&upcoming[0]].prepared.clone().expect("it is there"));
             }
             if all && self.loader.is_idle() {
                 // Masks in addition to alpha take more than was assumed: not all fit.
                 all = false;
                 continue;
             }
-            self.keep(true)?;
+            self.store_loaded(true)?;
             self.load_ahead(upcoming);
         }
     }
@@ -169,14 +169,14 @@ impl PhotoCache {
         let total = |scale: f32| -> usize { self.dataset.train.iter().map(|view| self.size(*view, scale)).sum() };
         let (full, scaled) = (total(1.0), total(scale));
         let fitting = self.budget * self.dataset.train.len() / scaled.max(1);
-        self.ahead = (AHEAD * self.threads).min(fitting / 2).max(1);
+        self.ahead = (PREFETCH_PER_THREAD * self.threads).min(fitting / 2).max(1);
         self.fits = scaled <= self.budget;
         self.keeps_full = scale < 1.0 && full + scaled <= self.budget;
-        self.held.retain(|_, held| {
-            held.prepared = None;
-            held.full.is_some()
+        self.cached.retain(|_, cached| {
+            cached.prepared = None;
+            cached.full.is_some()
         });
-        self.bytes = self.held.values().map(Held::bytes).sum();
+        self.bytes = self.cached.values().map(CachedPhoto::bytes).sum();
     }
 
     /// Maximum number of bytes of a view's photograph at `scale`.
@@ -186,29 +186,29 @@ impl PhotoCache {
     }
 
     /// Whether view `view` is in memory at the current scale.
-    fn is_there(&self, view: &usize) -> bool {
-        self.held.get(view).is_some_and(|held| held.prepared.is_some())
+    fn is_cached(&self, view: &usize) -> bool {
+        self.cached.get(view).is_some_and(|cached| cached.prepared.is_some())
     }
 
     /// Bytes to reserve for loading view `view`, beyond what is in memory already.
     fn reserved(&self, view: usize) -> usize {
         let full = if self.keeps_full { self.size(view, 1.0) } else { 0 };
-        let held = self.held.get(&view).map_or(0, Held::bytes);
-        (self.size(view, self.scale) + full).saturating_sub(held)
+        let cached = self.cached.get(&view).map_or(0, CachedPhoto::bytes);
+        (self.size(view, self.scale) + full).saturating_sub(cached)
     }
 
     /// Stores the photographs that were loaded; waits for at least one if `wait`.
-    fn keep(&mut self, wait: bool) -> Result<(), LoadError> {
+    fn store_loaded(&mut self, wait: bool) -> Result<(), LoadError> {
         for Loaded { view, scale, result } in self.loader.take(wait) {
             let (prepared, full) = result?;
-            let held = self.held.entry(view).or_default();
-            self.bytes -= held.bytes();
+            let cached = self.cached.entry(view).or_default();
+            self.bytes -= cached.bytes();
             // A photograph loaded for an earlier scale may still be of use at full size.
-            held.full = full.filter(|_| self.keeps_full);
+            cached.full = full.filter(|_| self.keeps_full);
             if scale == self.scale {
-                held.prepared = Some(prepared);
+                cached.prepared = Some(prepared);
             }
-            self.bytes += held.bytes();
+            self.bytes += cached.bytes();
         }
         Ok(())
     }
@@ -220,23 +220,23 @@ impl PhotoCache {
         } else {
             self.ahead.min(upcoming.len())
         };
-        if upcoming[..horizon].iter().all(|view| self.is_there(view)) {
+        if upcoming[..horizon].iter().all(|view| self.is_cached(view)) {
             return;
         }
         let in_flight = self.loader.in_flight();
         let mut planned: usize = in_flight.iter().map(|view| self.reserved(*view)).sum();
         let mut jobs = Vec::new();
-        let last_needed = LastNeeded::new(upcoming, self.dataset.views.len());
+        let eviction = EvictionOrder::new(upcoming, self.dataset.views.len());
         for (position, view) in upcoming[..horizon].iter().enumerate() {
-            if self.is_there(view) || in_flight.contains(view) && position > 0 {
+            if self.is_cached(view) || in_flight.contains(view) && position > 0 {
                 continue;
             }
             let bytes = self.reserved(*view);
             while self.bytes + planned + bytes > self.budget {
-                let Some(evicted) = last_needed.of(&self.held, position) else {
+                let Some(evicted) = eviction.last_needed(&self.cached, position) else {
                     break;
                 };
-                self.bytes -= self.held.remove(&evicted).map_or(0, |held| held.bytes());
+                self.bytes -= self.cached.remove(&evicted).map_or(0, |cached| cached.bytes());
             }
             if position > 0 && self.bytes + planned + bytes > self.budget {
                 break;
@@ -248,9 +248,9 @@ impl PhotoCache {
                 view: *view,
                 scale: self.scale,
                 full: self
-                    .held
+                    .cached
                     .get(view)
-                    .and_then(|held| held.full.clone())
+                    .and_then(|cached| cached.full.clone())
                     .filter(|_| from_full),
                 keep_full: self.keeps_full && from_full,
             });
@@ -260,12 +260,12 @@ impl PhotoCache {
 }
 
 /// Finds the photographs in memory that are needed last.
-struct LastNeeded {
+struct EvictionOrder {
     /// By view: its position among the upcoming ones.
     positions: Vec<usize>,
 }
 
-impl LastNeeded {
+impl EvictionOrder {
     fn new(upcoming: &[usize], views: usize) -> Self {
         let mut positions = vec![usize::MAX; views];
         for (position, view) in upcoming.iter().enumerate().rev() {
@@ -274,9 +274,9 @@ impl LastNeeded {
         Self { positions }
     }
 
-    /// The view of `held` that is needed last, after `position`.
-    fn of(&self, held: &HashMap<usize, Held>, position: usize) -> Option<usize> {
-        let later = held.keys().filter(|view| self.positions[**view] > position);
+    /// The view of `cached` that is needed last, after `position`.
+    fn last_needed(&self, cached: &HashMap<usize, CachedPhoto>, position: usize) -> Option<usize> {
+        let later = cached.keys().filter(|view| self.positions[**view] > position);
         later.max_by_key(|view| (self.positions[**view], **view)).copied()
     }
 }
@@ -364,7 +364,7 @@ mod tests {
         for i in 0..40 {
             let upcoming: Vec<usize> = (0..20).map(|k| (i + k) % 20).collect();
             assert_eq!(cache.get(&upcoming, 1.0).unwrap().rgb[0] as usize, upcoming[0]);
-            assert!(cache.bytes <= 2000 && cache.bytes == cache.held.values().map(Held::bytes).sum::<usize>());
+            assert!(cache.bytes <= 2000 && cache.bytes == cache.cached.values().map(CachedPhoto::bytes).sum::<usize>());
         }
         // A fifth of the photographs fits, and stays.
         assert!((20..40).contains(&loads(&sources)), "{}", loads(&sources));
@@ -386,7 +386,7 @@ mod tests {
         }
         assert_eq!(loads(&sources), 20);
         assert!(
-            cache.held.values().all(|held| held.full.is_none()),
+            cache.cached.values().all(|cached| cached.full.is_none()),
             "at full size one copy suffices"
         );
     }

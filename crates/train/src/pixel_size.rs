@@ -15,14 +15,14 @@ pub(crate) fn pixel_size(dataset: &Dataset) -> f32 {
     let size = |view: &usize| {
         let view = &dataset.views[*view];
         let camera = &view.camera;
-        let depth = depth_shown(dataset, view, focus);
+        let depth = view_depth(dataset, view, focus);
         f64::from(depth.max(camera.near) / camera.intrinsics.fx.max(camera.intrinsics.fy))
     };
     median(dataset.train.par_iter().map(size).collect()) as f32
 }
 
 /// The median depth of the points that a view sees, else the geometric mean of its depth bounds, else the distance of the cameras' `focus`.
-pub(crate) fn depth_shown(dataset: &Dataset, view: &View, focus: Vec3) -> f32 {
+pub(crate) fn view_depth(dataset: &Dataset, view: &View, focus: Vec3) -> f32 {
     typical_depth(dataset, view).unwrap_or_else(|| focus.distance(view.camera.pose.position))
 }
 

@@ -22,14 +22,14 @@ pub struct RunLimits {
 }
 
 /// Fraction of its budget below which a run has ended early.
-const EARLY: f64 = 0.9;
+const EARLY_END_FRACTION: f64 = 0.9;
 
 /// Steps between evaluations of the held-out views for `until_psnr`.
-const UNTIL_PSNR_EVERY: u64 = 50;
+const UNTIL_PSNR_INTERVAL: u64 = 50;
 
 /// Maximum number of held-out views of an evaluation during training: all 200 of a Blender scene took longer than the steps between
 /// evaluations.
-const MOST_EVALUATED: usize = 32;
+const MAX_EVALUATED: usize = 32;
 
 /// Interval at which observers of a paused run are polled: imperceptible to a person, and a negligible load.
 const PAUSE_INTERVAL: Duration = Duration::from_millis(20);
@@ -81,7 +81,7 @@ pub fn run(
         });
     }
     let mut forecast = Forecast::default();
-    let mut requests = tell(trainer, &mut events, observers);
+    let mut requests = notify(trainer, &mut events, observers);
     wait_while_paused(trainer, &mut requests, &mut events, observers);
     let mut reason = None;
     // Loading for the first splats is not part of the steps.
@@ -91,14 +91,12 @@ pub fn run(
         let due = plan(&trainer.recipe, &trainer.clock);
         forecast.observe(trainer, &due, limits.budget.is_some());
         if let Some(budget) = limits.budget {
-            trainer.pace = forecast
-                .pace(trainer, budget - trainer.seconds)
-                .max(trainer.least_pace());
+            trainer.pace = forecast.pace(trainer, budget - trainer.seconds).max(trainer.min_pace());
         }
         if let Some(pace) = limits.paces.as_ref().and_then(|paces| paces.at(trainer.clock.step + 1)) {
             trainer.pace = pace;
         }
-        let evaluates = due.evaluate || (limits.until_psnr.is_some() && is_due(&trainer.clock, UNTIL_PSNR_EVERY));
+        let evaluates = due.evaluate || (limits.until_psnr.is_some() && is_due(&trainer.clock, UNTIL_PSNR_INTERVAL));
         let left = forecast.seconds_left(trainer);
         let range = match limits.budget {
             // The pace follows the budget.
@@ -116,7 +114,7 @@ pub fn run(
             let (step, seconds, splats) = (trainer.clock.step, trainer.seconds, trainer.engine.len());
             let started = Instant::now();
             let views = match limits.until_psnr {
-                None => some_of(&trainer.dataset.test),
+                None => evenly_spaced(&trainer.dataset.test),
                 // The limit is on the PSNR of all views.
                 Some(_) => trainer.dataset.test.clone(),
             };
@@ -135,7 +133,7 @@ pub fn run(
                 reason = Some("held-out PSNR reached");
             }
         }
-        requests = tell(trainer, &mut events, observers);
+        requests = notify(trainer, &mut events, observers);
         trainer.times.wall = before + began.elapsed().as_secs_f64();
         if due.checkpoint || requests.save || requests.stop {
             let started = Instant::now();
@@ -151,8 +149,8 @@ pub fn run(
         trainer.times.wall = before + began.elapsed().as_secs_f64();
     }
     trainer.read_back()?;
-    events.extend(fewer_than_at_first(trainer));
-    events.extend(read_for_losses(trainer));
+    events.extend(lost_splats_event(trainer));
+    events.extend(cpu_loss_warning(trainer));
     events.extend(limits.budget.and_then(|budget| ended_early(trainer, budget)));
     let stopped = if requests.stop { "stopped" } else { "recipe complete" };
     let reason = reason.unwrap_or(stopped).to_owned();
@@ -162,14 +160,14 @@ pub fn run(
         reason: reason.clone(),
     });
     while !events.is_empty() {
-        tell(trainer, &mut events, observers);
+        notify(trainer, &mut events, observers);
     }
     Ok(reason)
 }
 
 /// What became of the first splats, if a run ends with fewer; a warning if hardly any are left.
-fn fewer_than_at_first(trainer: &Trainer) -> Option<Event> {
-    let (first, last) = (trainer.splats_at_first, trainer.engine.len());
+fn lost_splats_event(trainer: &Trainer) -> Option<Event> {
+    let (first, last) = (trainer.initial_splats, trainer.engine.len());
     if trainer.field.is_some() || !trainer.finished() || last >= first {
         return None;
     }
@@ -186,8 +184,8 @@ fn fewer_than_at_first(trainer: &Trainer) -> Option<Event> {
 /// Why a run ended before its `budget`, in seconds, was used up.
 fn ended_early(trainer: &Trainer, budget: f64) -> Option<Event> {
     let (steps, seconds) = (trainer.clock.step, trainer.seconds);
-    let is_limited = trainer.finished() && trainer.pace == trainer.least_pace();
-    (is_limited && seconds < EARLY * budget).then(|| Event::Decided {
+    let is_limited = trainer.finished() && trainer.pace == trainer.min_pace();
+    (is_limited && seconds < EARLY_END_FRACTION * budget).then(|| Event::Decided {
         message: format!(
             "{seconds:.0} s of {budget:.0} were needed: photographs are so far apart that more than {steps} steps would only \
              fit single ones (--steps sets another number)"
@@ -196,8 +194,8 @@ fn ended_early(trainer: &Trainer, budget: f64) -> Option<Event> {
 }
 
 /// How many steps had losses that only the CPU computes, although the splats are on a GPU.
-fn read_for_losses(trainer: &Trainer) -> Option<Event> {
-    let (steps, device) = (trainer.read_for_losses, &trainer.options.device);
+fn cpu_loss_warning(trainer: &Trainer) -> Option<Event> {
+    let (steps, device) = (trainer.cpu_loss_steps, &trainer.options.device);
     (steps > 0).then(|| Event::Warned {
         message: format!(
             "the losses of {steps} steps were computed on the CPU, from frames read back from {device}: recipe {} uses some that the GPU \
@@ -220,7 +218,7 @@ fn save(trainer: &Trainer, events: &mut Vec<Event>, observers: &mut [&mut dyn Ob
     }
 }
 
-fn tell(trainer: &Trainer, events: &mut Vec<Event>, observers: &mut [&mut dyn Observer]) -> Requests {
+fn notify(trainer: &Trainer, events: &mut Vec<Event>, observers: &mut [&mut dyn Observer]) -> Requests {
     let mut requests = Requests::default();
     for event in events.drain(..) {
         for observer in observers.iter_mut() {
@@ -246,7 +244,7 @@ fn wait_while_paused(
     }
     let step = trainer.clock.step;
     events.push(Event::Paused { step });
-    requests.stop |= tell(trainer, events, observers).stop;
+    requests.stop |= notify(trainer, events, observers).stop;
     while requests.pause && !requests.stop {
         std::thread::sleep(PAUSE_INTERVAL);
         *requests = Requests::default();
@@ -255,16 +253,16 @@ fn wait_while_paused(
         }
         if requests.save || requests.stop {
             save(trainer, events, observers);
-            requests.stop |= tell(trainer, events, observers).stop;
+            requests.stop |= notify(trainer, events, observers).stop;
         }
     }
     events.push(Event::Resumed { step });
-    requests.stop |= tell(trainer, events, observers).stop;
+    requests.stop |= notify(trainer, events, observers).stop;
 }
 
-/// At most [`MOST_EVALUATED`] of `views`, evenly spaced.
-fn some_of(views: &[usize]) -> Vec<usize> {
-    let count = views.len().min(MOST_EVALUATED);
+/// At most [`MAX_EVALUATED`] of `views`, evenly spaced.
+fn evenly_spaced(views: &[usize]) -> Vec<usize> {
+    let count = views.len().min(MAX_EVALUATED);
     (0..count).map(|i| views[i * views.len() / count]).collect()
 }
 
@@ -299,9 +297,9 @@ mod tests {
 
     /// What was decided.
     #[derive(Default)]
-    struct Told(Vec<String>);
+    struct DecisionLog(Vec<String>);
 
-    impl Observer for Told {
+    impl Observer for DecisionLog {
         fn on_event(&mut self, event: &Event, _: &Trainer) -> Signal {
             if let Event::Decided { message } = event {
                 self.0.push(message.clone());
@@ -318,21 +316,21 @@ mod tests {
             budget: Some(3600.0),
             ..RunLimits::default()
         };
-        let mut told = Told::default();
-        let reason = run(&mut trainer, &limits, &mut [&mut told]).unwrap();
+        let mut log = DecisionLog::default();
+        let reason = run(&mut trainer, &limits, &mut [&mut log]).unwrap();
         assert_eq!((trainer.clock.step, reason.as_str()), (600, "recipe complete"));
         assert!(
-            told.0.iter().any(|line| line.contains("of 3600 were needed")),
+            log.0.iter().any(|line| line.contains("of 3600 were needed")),
             "{:?}",
-            told.0
+            log.0
         );
     }
 
     #[test]
     fn an_evaluation_during_training_has_few_views_from_all_over() {
-        assert_eq!(some_of(&[7, 8, 9]), [7, 8, 9]);
-        let views = some_of(&(100..300).collect::<Vec<_>>());
-        assert_eq!(views.len(), MOST_EVALUATED);
+        assert_eq!(evenly_spaced(&[7, 8, 9]), [7, 8, 9]);
+        let views = evenly_spaced(&(100..300).collect::<Vec<_>>());
+        assert_eq!(views.len(), MAX_EVALUATED);
         assert!(views[0] == 100 && views[31] > 290 && views.is_sorted_by(|a, b| (6..=7).contains(&(b - a))));
     }
 }

@@ -1,7 +1,7 @@
 //! The angle between adjacent photographs, as seen from what they show. If it is large, only a few photographs determine what lies between
 //! them.
 
-use crate::pixel_size::depth_shown;
+use crate::pixel_size::view_depth;
 use crate::robust::median;
 use crate::trainer::train_cameras;
 use glam::Vec3;
@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use std::f64::consts::PI;
 
 /// Cameras closer than this fraction of the depth are at the same place, as the faces of a panorama are.
-const SAME_PLACE: f32 = 1e-3;
+const MIN_BASELINE: f32 = 1e-3;
 
 /// The angle between adjacent photographs, radians: at the point on a view's axis that is as deep as what the view shows, the smallest
 /// angle between its camera and another one that sees the point; pi if no other one does. The median over the training views.
@@ -21,12 +21,13 @@ pub(crate) fn spacing(dataset: &Dataset) -> f64 {
     let angle = |view: &usize| {
         let view = &dataset.views[*view];
         let pose = &view.camera.pose;
-        let depth = depth_shown(dataset, view, focus);
-        let shown = pose.world_from_camera(depth * Vec3::Z);
+        let depth = view_depth(dataset, view, focus);
+        let target = pose.world_from_camera(depth * Vec3::Z);
         let others = cameras.iter().filter(|other| {
-            other.pose.position.distance(pose.position) > SAME_PLACE * depth && other.sees(shown).is_some()
+            other.pose.position.distance(pose.position) > MIN_BASELINE * depth && other.sees(target).is_some()
         });
-        let angles = others.map(|other| f64::from((pose.position - shown).angle_between(other.pose.position - shown)));
+        let angles =
+            others.map(|other| f64::from((pose.position - target).angle_between(other.pose.position - target)));
         angles.fold(PI, f64::min)
     };
     median(dataset.train.par_iter().map(angle).collect())

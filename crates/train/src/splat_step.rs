@@ -19,7 +19,7 @@ use std::time::Instant;
 const STREAM_DENSIFY: u64 = 2;
 const STREAM_STEP: u64 = 5;
 /// Training views over which the convergence error is measured.
-const MEASURED_VIEWS: usize = 8;
+const MAX_MEASURED_VIEWS: usize = 8;
 
 impl Trainer {
     /// One step on splats; events are appended to `events`.
@@ -42,11 +42,11 @@ impl Trainer {
             .is_on(Param::RandomBackground)
             .then(|| std::array::from_fn(|_| rng.uniform()))
             .filter(|_| photo.alpha.is_some());
-        let usual = self.render_options(plan.sh_degree);
+        let base = self.render_options(plan.sh_degree);
         let options = RenderOptions {
-            background: background.unwrap_or(usual.background),
+            background: background.unwrap_or(base.background),
             depth: plan.compares_depth(),
-            ..usual
+            ..base
         };
         let mut depth_map = self.given_depths(view, &camera, &plan);
         let mut normal_map = self.given_normals(view, &camera, &plan);
@@ -69,7 +69,7 @@ impl Trainer {
                 .map(|(samples, reach)| (&samples[..], *reach, &camera.intrinsics)),
         };
         let (update, has_lpips) = (self.update(&plan, view, &camera), self.options.lpips.is_some());
-        let ahead = self.sockets.are_empty().then(|| {
+        let ahead = self.sockets.is_empty().then(|| {
             let frame = (&camera, &options);
             self.device_loss
                 .whole_step(&mut self.engine, frame, &reference, &plan, &update, has_lpips)
@@ -120,7 +120,7 @@ impl Trainer {
         rng: &mut Rng,
     ) -> ObjectiveValues {
         let camera_gradient = self.sockets.needs_camera_gradient();
-        let on_device = (!self.sockets.are_after_blending()).then(|| {
+        let on_device = (!self.sockets.any_after_blending()).then(|| {
             let has_lpips = self.options.lpips.is_some();
             self.device_loss
                 .step(&mut self.engine, reference, plan, camera_gradient, has_lpips)
@@ -128,7 +128,7 @@ impl Trainer {
         if let Some(loss) = on_device.flatten() {
             return loss;
         }
-        self.read_for_losses += u64::from(self.engine.is_on_gpu());
+        self.cpu_loss_steps += u64::from(self.engine.is_on_gpu());
         let frame = FramePlanes {
             color: self.sockets.frame_color(&self.engine),
             ..self.engine.frame()
@@ -159,7 +159,7 @@ impl Trainer {
         let longer = self.pace.min(1.0).powf(f64::from(self.recipe.length_exponent)) as f32;
         let mut rates = plan.rates().scaled(longer);
         // The rate at the depth of most of the scene.
-        let typical_rate = rates.means * self.extent_of_rate;
+        let typical_rate = rates.means * self.rate_extent;
         if self.recipe.extent_pixels > 0.0 {
             let k = &self.dataset.views[view].camera.intrinsics;
             rates.means *= self.recipe.extent_pixels / k.fx.max(k.fy);
@@ -179,7 +179,7 @@ impl Trainer {
             },
             trained_fraction: plan.value(Param::TrainedShare),
             rates,
-            sh_degree: plan.sh_degree,
+            sh_degree: plan.sh_degree.max(self.first_sh_degree),
             optimizer: Optimizer {
                 step: AdamStep {
                     beta1: adam.beta1,
@@ -202,9 +202,9 @@ impl Trainer {
     /// Mean L1 error over some training views, evenly spaced, as the plan renders them.
     fn measure_error(&mut self, plan: &StepPlan) -> Result<f64, TrainError> {
         let (mut sum, mut count) = (0.0, 0);
-        self.show_training_views(MEASURED_VIEWS, plan, false, |trainer, view, photo| {
-            let shown = trainer.hidden.apply(view, &trainer.dataset.views[view].camera, photo);
-            sum += trainer.errors_of_frame(shown.as_ref().unwrap_or(photo))[0];
+        self.render_training_views(MAX_MEASURED_VIEWS, plan, false, |trainer, view, photo| {
+            let masked = trainer.hidden.apply(view, &trainer.dataset.views[view].camera, photo);
+            sum += trainer.frame_errors(masked.as_ref().unwrap_or(photo))[0];
             count += 1;
         })?;
         Ok(sum / f64::from(count.max(1)))
@@ -234,7 +234,7 @@ impl Trainer {
         let (intersections, pixels) = (self.engine.intersections(), self.engine.pixels());
         let limit = self
             .limit(self.clock.stage, round.count_share)
-            .min(self.engine.most_splats());
+            .min(self.engine.max_splats());
         let first = first_count(&self.dataset, &self.recipe);
         let mut rng = Rng::new(self.options.seed ^ self.clock.step << 20, STREAM_DENSIFY);
         self.engine.edit_density(|state| {

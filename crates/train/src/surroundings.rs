@@ -7,7 +7,7 @@
 //! 17.9 dB (nine runs, whose spread is 0.7); twenty captures reduced to 3 to 13 photographs, -0.01 dB in the mean. If splats near points
 //! are moved as well, a fox in front of a wall, 8 photographs, loses 0.7 dB, since the wall is near cameras.
 
-use crate::conditions::SPARSE;
+use crate::conditions::SPARSE_ANGLE_DEGREES;
 use crate::robust::median;
 use crate::trainer::train_cameras;
 use glam::Vec3;
@@ -17,13 +17,13 @@ use rayon::prelude::*;
 
 /// Distance from the focus beyond which splats may be among the cameras. This and the following distances are in units of the cameras'
 /// median distance from their focus.
-const OUTSIDE: f32 = 0.6;
+const MIN_FOCUS_DISTANCE: f32 = 0.6;
 /// Distance to the nearest camera below which a splat is among the cameras.
-const BESIDE: f32 = 1.2;
+const MAX_CAMERA_DISTANCE: f32 = 1.2;
 /// Distance to the nearest point below which the place of a splat is known.
-const KNOWN: f32 = 0.3;
+const MIN_POINT_DISTANCE: f32 = 0.3;
 /// Distance from the focus to which splats are moved.
-const FAR: f32 = 3.0;
+const FAR_DISTANCE: f32 = 3.0;
 
 /// The cameras of sparse photographs, and the points that are known.
 #[derive(Clone, Debug)]
@@ -40,7 +40,7 @@ impl Surroundings {
     /// The surroundings of photographs that are `spacing` radians apart; `None` if they are close, or no points are known.
     pub(crate) fn new(dataset: &Dataset, spacing: f64) -> Option<Self> {
         let points = dataset.points.as_ref()?.positions.clone();
-        if points.is_empty() || spacing.to_degrees() < SPARSE {
+        if points.is_empty() || spacing.to_degrees() < SPARSE_ANGLE_DEGREES {
             return None;
         }
         let cameras = train_cameras(dataset);
@@ -62,7 +62,7 @@ impl Surroundings {
             .with_min_len(1024)
             .filter_map(|i| {
                 let position = Vec3::from_array(splats.mean(i));
-                let (eye, times) = self.unknown(position)?;
+                let (eye, times) = self.relocation(position)?;
                 Some((i, eye + times * (position - eye), times.ln()))
             })
             .collect();
@@ -77,11 +77,17 @@ impl Surroundings {
     }
 
     /// For a splat at `position` whose distance is unknown, the position of the only camera that sees it, and the factor on its distance
-    /// from that camera that moves it to the distance [`FAR`] from the focus.
-    fn unknown(&self, position: Vec3) -> Option<(Vec3, f32)> {
-        let [outside, beside, known, far] = [OUTSIDE, BESIDE, KNOWN, FAR].map(|times| times * self.distance);
+    /// from that camera that moves it to the distance [`FAR_DISTANCE`] from the focus.
+    fn relocation(&self, position: Vec3) -> Option<(Vec3, f32)> {
+        let [min_focus, max_camera, min_point, far] = [
+            MIN_FOCUS_DISTANCE,
+            MAX_CAMERA_DISTANCE,
+            MIN_POINT_DISTANCE,
+            FAR_DISTANCE,
+        ]
+        .map(|times| times * self.distance);
         let is_within = |place: Vec3, reach: f32| place.distance_squared(position) < reach * reach;
-        if is_within(self.focus, outside) || !is_within(self.focus, far) {
+        if is_within(self.focus, min_focus) || !is_within(self.focus, far) {
             return None;
         }
         let mut seeing = self.cameras.iter().filter(|camera| camera.sees(position).is_some());
@@ -93,9 +99,9 @@ impl Surroundings {
         let is_among_cameras = || {
             self.cameras
                 .iter()
-                .any(|camera| is_within(camera.pose.position, beside))
+                .any(|camera| is_within(camera.pose.position, max_camera))
         };
-        if !is_beyond_focus || !is_among_cameras() || self.points.iter().any(|point| is_within(*point, known)) {
+        if !is_beyond_focus || !is_among_cameras() || self.points.iter().any(|point| is_within(*point, min_point)) {
             return None;
         }
         // Where the ray leaves the sphere: |eye + times along - focus| = far.

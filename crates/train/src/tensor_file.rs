@@ -16,7 +16,7 @@ pub struct NamedTensor {
 
 impl NamedTensor {
     /// 32-bit floats, as many as `shape` holds.
-    pub fn real(name: impl Into<String>, shape: Vec<usize>, values: &[f32]) -> Self {
+    pub fn f32s(name: impl Into<String>, shape: Vec<usize>, values: &[f32]) -> Self {
         Self {
             name: name.into(),
             shape,
@@ -26,7 +26,7 @@ impl NamedTensor {
     }
 
     /// Double-precision numbers, one-dimensional.
-    pub(crate) fn double(name: impl Into<String>, values: &[f64]) -> Self {
+    pub(crate) fn f64s(name: impl Into<String>, values: &[f64]) -> Self {
         Self {
             name: name.into(),
             shape: vec![values.len()],
@@ -36,7 +36,7 @@ impl NamedTensor {
     }
 
     /// Integers, one-dimensional.
-    pub fn whole(name: impl Into<String>, values: &[u64]) -> Self {
+    pub fn u64s(name: impl Into<String>, values: &[u64]) -> Self {
         Self {
             name: name.into(),
             shape: vec![values.len()],
@@ -96,7 +96,7 @@ impl<'a> TensorSource<'a> {
     }
 
     /// The 32-bit floats named `name`.
-    pub fn real(&self, name: &str) -> Option<Vec<f32>> {
+    pub fn f32s(&self, name: &str) -> Option<Vec<f32>> {
         let view = self.view(name, Dtype::F32)?;
         Some(
             view.data()
@@ -117,12 +117,12 @@ impl<'a> TensorSource<'a> {
         if view.shape() != [rows, N] {
             return Err(format!("{name} has the shape {:?}, not [{rows}, {N}]", view.shape()));
         }
-        let values = self.real(name).unwrap_or_default();
+        let values = self.f32s(name).unwrap_or_default();
         Ok(values.as_chunks().0.to_vec())
     }
 
     /// The integers named `name`.
-    pub fn whole(&self, name: &str) -> Option<Vec<u64>> {
+    pub fn u64s(&self, name: &str) -> Option<Vec<u64>> {
         let view = self.view(name, Dtype::U64)?;
         Some(
             view.data()

@@ -114,7 +114,7 @@ impl Default for TrainOptions {
 pub(crate) const STREAM_INIT: u64 = 1;
 
 /// A run of sparse photographs has at least the recipe's own number of steps divided by this.
-const LEAST_SPARSE: u64 = 5;
+const MAX_SPARSE_DIVISOR: u64 = 5;
 
 /// A run's whole state.
 pub struct Trainer {
@@ -142,7 +142,7 @@ pub struct Trainer {
     pub extent: f32,
     /// The length to which the rate of the means is relative, world units: the extent, or a number of pixels at the depth of what most
     /// views show.
-    pub(crate) extent_of_rate: f32,
+    pub(crate) rate_extent: f32,
     /// Wall time of all steps so far, excluding the loading of photographs and the evaluation of held-out views.
     pub seconds: f64,
     /// CPU time of all steps so far, over all threads.
@@ -167,14 +167,16 @@ pub struct Trainer {
     pub(crate) objective: Objective,
     pub(crate) device_loss: DeviceLoss,
     /// Steps of this process whose frames were read back from a GPU for their losses.
-    pub(crate) read_for_losses: u64,
+    pub(crate) cpu_loss_steps: u64,
     pub(crate) free_space: FreeSpace,
     /// Number of splats before the first step, or, if fewer, before the first step since the run was resumed: edits may have removed some.
-    pub(crate) splats_at_first: usize,
+    pub(crate) initial_splats: usize,
     /// Angle between adjacent training photographs, radians.
     pub(crate) spacing: f64,
     /// The surroundings of sparse photographs; absent if the recipe has no free space.
     pub(crate) surroundings: Option<Surroundings>,
+    /// The SH bands that the first splats already had. They are in use from the first step on, whatever the recipe says.
+    pub(crate) first_sh_degree: u32,
 }
 
 impl Trainer {
@@ -184,12 +186,12 @@ impl Trainer {
     /// When there are no training views or no initial points, or photographs needed for colours cannot be read.
     pub fn new(dataset: Arc<Dataset>, recipe: Recipe, options: TrainOptions) -> Result<Self, TrainError> {
         let first = first_count(&dataset, &recipe);
-        let mut trainer = Self::unfilled(dataset, recipe, options, first)?;
+        let mut trainer = Self::with_empty_state(dataset, recipe, options, first)?;
         if trainer.memory.splats < trainer.memory.wanted_splats {
             // Stored in the recipe, so that a resumed run has the same limit.
             trainer.recipe.max_splats = trainer.memory.splats;
         }
-        trainer.settle_conditions()?;
+        trainer.apply_data_conditions()?;
         if is_field(&trainer.recipe, 0) {
             let state = trainer.first_field()?;
             trainer.set_field(state)?;
@@ -215,15 +217,16 @@ impl Trainer {
         if splats.is_empty() {
             return Err(TrainError::NoSplats);
         }
-        let mut trainer = Self::unfilled(dataset, recipe, options, splats.len())?;
-        trainer.settle_conditions()?;
+        let mut trainer = Self::with_empty_state(dataset, recipe, options, splats.len())?;
+        trainer.apply_data_conditions()?;
+        trainer.first_sh_degree = splats.used_sh_degree();
         *trainer.engine.state_mut() = SplatState::new(splats);
         trainer.sockets = trainer.first_sockets()?;
         Ok(trainer)
     }
 
     /// A trainer whose state is yet to be filled in with `first_splats` splats, by a checkpoint for example.
-    pub(crate) fn unfilled(
+    pub(crate) fn with_empty_state(
         mut dataset: Arc<Dataset>,
         recipe: Recipe,
         options: TrainOptions,
@@ -236,7 +239,7 @@ impl Trainer {
         let total = recipe.total_steps() as f64;
         let needs = Needs {
             first_splats,
-            most_splats: if (0..recipe.stage.len()).all(|stage| is_field(&recipe, stage)) {
+            max_splats: if (0..recipe.stage.len()).all(|stage| is_field(&recipe, stage)) {
                 0
             } else {
                 cap(&recipe, &cameras).max(first_splats)
@@ -258,12 +261,12 @@ impl Trainer {
             cpu_seconds: 0.0,
             times: Times::default(),
             extent,
-            extent_of_rate: match recipe.extent_pixels {
+            rate_extent: match recipe.extent_pixels {
                 pixels if pixels > 0.0 => pixels * pixel_size(&dataset),
                 _ => extent,
             },
             photos: PhotoCache::new(dataset.clone(), recipe.render.background, memory.photos),
-            cap: cap(&recipe, &cameras).min(memory.splats).min(engine.most_splats()),
+            cap: cap(&recipe, &cameras).min(memory.splats).min(engine.max_splats()),
             memory,
             pixels: mean_pixels(&cameras),
             decisions,
@@ -272,15 +275,16 @@ impl Trainer {
             depths: HashMap::new(),
             objective: Objective::new(options.lpips.clone()),
             device_loss: DeviceLoss::new(&options.device)?,
-            read_for_losses: 0,
+            cpu_loss_steps: 0,
             free_space: FreeSpace::new(&dataset, recipe.free_space),
-            splats_at_first: first_splats,
+            initial_splats: first_splats,
             spacing,
             surroundings: (recipe.free_space > 0.0)
                 .then(|| Surroundings::new(&dataset, spacing))
                 .flatten(),
             engine,
             field: None,
+            first_sh_degree: 0,
             sockets: Sockets::default(),
             trained: dataset.train.clone(),
             hidden: Hidden::default(),
@@ -333,13 +337,13 @@ impl Trainer {
     }
 
     /// The minimum pace of a run without a given number of steps, by the limit on steps per training photograph.
-    pub(crate) fn least_pace(&self) -> f64 {
-        match self.most_visits() {
+    pub(crate) fn min_pace(&self) -> f64 {
+        match self.max_visits() {
             0 => 0.0,
             visits => {
                 let total = self.recipe.total_steps();
-                let most = visits.saturating_mul(self.dataset.train.len() as u64);
-                total as f64 / most.max(total / LEAST_SPARSE).max(1) as f64
+                let max_steps = visits.saturating_mul(self.dataset.train.len() as u64);
+                total as f64 / max_steps.max(total / MAX_SPARSE_DIVISOR).max(1) as f64
             }
         }
     }
@@ -380,7 +384,7 @@ impl Trainer {
         let before = self.clock.time;
         let entered = self.tick(metrics) && !self.finished();
         let total = self.recipe.total_steps() as f64;
-        let at = exposure_probe::AT * total;
+        let at = exposure_probe::PROBE_AT * total;
         // A bilateral grid contains an exposure: there is nothing to decide.
         let undecided = self.recipe.exposure == Choice::Auto && self.sockets.bilateral.is_none();
         let probes = undecided && self.field.is_none();
@@ -442,24 +446,24 @@ impl Trainer {
     }
 
     /// The mean L1 error of the last frame over the pixels that its photograph shows, and over those of them that fit best.
-    pub(crate) fn errors_of_frame(&mut self, photo: &Prepared) -> [f64; 2] {
+    pub(crate) fn frame_errors(&mut self, photo: &Prepared) -> [f64; 2] {
         let color = self.sockets.frame_color(&self.engine);
         self.objective.error(color, photo, false);
         self.objective.mean_errors(photo)
     }
 
-    /// Renders at most `most` training views, evenly spaced, as in `plan`, with depth if `depth`, and passes each with its whole photograph
-    /// to `see`.
-    pub(crate) fn show_training_views(
+    /// Renders at most `max_views` training views, evenly spaced, as in `plan`, with depth if `depth`, and passes each with its whole
+    /// photograph to `visit`.
+    pub(crate) fn render_training_views(
         &mut self,
-        most: usize,
+        max_views: usize,
         plan: &StepPlan,
         depth: bool,
-        mut see: impl FnMut(&mut Self, usize, &Prepared),
+        mut visit: impl FnMut(&mut Self, usize, &Prepared),
     ) -> Result<(), TrainError> {
         let upcoming = upcoming_views(&self.trained, self.options.seed, &self.clock);
         let train = self.trained.clone();
-        let stride = train.len().div_ceil(most).max(1);
+        let stride = train.len().div_ceil(max_views).max(1);
         for view in train.into_iter().step_by(stride) {
             let order: Vec<usize> = std::iter::once(view)
                 .chain(upcoming.iter().copied().filter(|other| *other != view))
@@ -472,7 +476,7 @@ impl Trainer {
                 ..self.render_options(plan.sh_degree)
             };
             self.sockets.render(&mut self.engine, view, placement, &options, plan);
-            see(self, view, &photo);
+            visit(self, view, &photo);
             self.seconds += started.elapsed().as_secs_f64();
             self.cpu_seconds += cpu_started.elapsed().as_secs_f64();
         }
@@ -491,12 +495,12 @@ impl Trainer {
         ended
     }
 
-    /// How this run's frames are rendered, with SH up to `sh_degree`.
+    /// How this run's frames are rendered, with SH up to `sh_degree` and those that the first splats had.
     pub fn render_options(&self, sh_degree: u32) -> RenderOptions {
         let sky = self.sockets.sky.as_ref();
         RenderOptions {
             background: sky.map_or(self.recipe.render.background, Sky::background),
-            sh_degree,
+            sh_degree: sh_degree.max(self.first_sh_degree),
             antialias: self.recipe.render.antialias,
             ..RenderOptions::default()
         }
@@ -546,7 +550,7 @@ impl Trainer {
                 .sockets
                 .residual
                 .as_ref()
-                .and_then(Residual::learnt)
+                .and_then(Residual::trained_field)
                 .map(|field| Box::new(field.clone())),
         }
     }

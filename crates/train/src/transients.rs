@@ -16,31 +16,31 @@ use rayon::prelude::*;
 use std::collections::BTreeMap;
 
 /// Blocks along the longer side of a photograph.
-const BLOCKS: u32 = 48;
+const LONG_SIDE_BLOCKS: u32 = 48;
 /// Minimum difference of a block's mean colour, sRGB, at which it may show a transient. With 0.08, soft shadows on the wall of fox count as
 /// well.
-const LEAST: f32 = 0.2;
+const MIN_DIFFERENCE: f32 = 0.2;
 /// Minimum factor over the difference at the same place in other views. A person pasted into 14 of 43 photographs of fox is found whole at
 /// 3 or 4, and nothing is found in the photographs without a person.
-const FACTOR: f32 = 3.0;
+const MIN_FACTOR: f32 = 3.0;
 /// Quantile of the differences in other views that is taken for the difference at a place. With the median, unlearned surfaces at the
 /// border of the scene count after a fifth of a run; with 0.75 and three witnesses, 25 of 62 photographs of can, whose background is hardly
 /// known, lose 12 % of their pixels each, and held-out PSNR falls by 0.4 dB.
 const WITNESS_QUANTILE: f32 = 0.9;
 /// Fraction of both limits at which neighbours of a transient's blocks belong to it.
-const GROW: f32 = 0.4;
+const GROWTH_THRESHOLD: f32 = 0.4;
 /// Minimum number of other views that see a block's surface.
 const MIN_WITNESSES: usize = 6;
 /// Maximum number of views consulted about each place, the nearest ones.
-const WITNESSES: usize = 24;
+const MAX_WITNESSES: usize = 24;
 /// Depths that differ by less than this fraction are those of the same surface.
-const SAME_DEPTH: f32 = 0.15;
+const DEPTH_TOLERANCE: f32 = 0.15;
 /// Depth assumed where a frame is empty, in extents of the scene.
-const FAR: f32 = 1000.0;
+const EMPTY_DEPTH: f32 = 1000.0;
 /// Minimum number of a transient's blocks beyond both limits; smaller transients average out over the photographs.
 const MIN_BLOCKS: usize = 6;
 /// Maximum hidden fraction of a photograph: beyond it, the photograph disagrees as a whole, and nothing of it is hidden.
-const MOST: f32 = 0.5;
+const MAX_HIDDEN_FRACTION: f32 = 0.5;
 
 /// A photograph divided into approximately square blocks. The grid depends on the full size of the photograph only.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -52,7 +52,7 @@ struct Grid {
 impl Grid {
     /// The grid of photographs with the full-size intrinsics `k`.
     fn of(k: &Intrinsics) -> Self {
-        let blocks = |side: u32| (BLOCKS * side).div_ceil(k.width.max(k.height)) as usize;
+        let blocks = |side: u32| (LONG_SIDE_BLOCKS * side).div_ceil(k.width.max(k.height)) as usize;
         Self {
             columns: blocks(k.width),
             rows: blocks(k.height),
@@ -108,14 +108,15 @@ impl Difference {
                 (i / grid.columns, grid.rows, height),
             ]
             .map(|(at, blocks, side)| Grid::start(at, blocks, side)..Grid::start(at + 1, blocks, side));
-            let (mut color, mut shown, mut depth, mut alpha, mut count) = ([0.0f32; 3], [0.0; 3], 0.0, 0.0, 0.0f32);
+            let (mut color, mut photo_color, mut depth, mut alpha, mut count) =
+                ([0.0f32; 3], [0.0; 3], 0.0, 0.0, 0.0f32);
             for at in rows.flat_map(|y| columns.clone().map(move |x| y * width + x)) {
                 if photo.mask.as_ref().is_some_and(|mask| mask[at] == 0) {
                     continue;
                 }
                 for c in 0..3 {
                     let value = f32::from(photo.rgb[3 * at + c]) / 255.0;
-                    shown[c] += value;
+                    photo_color[c] += value;
                     color[c] += value - frame.color[c * pixels + at];
                 }
                 depth += frame.depth[at];
@@ -125,10 +126,14 @@ impl Difference {
             let depth = if alpha >= 0.5 * count {
                 depth / alpha
             } else {
-                FAR * extent
+                EMPTY_DEPTH * extent
             };
             let mean = |sums: [f32; 3]| sums.map(|sum| sum / count);
-            (mean(color), mean(shown), if count > 0.0 { depth } else { f32::NAN })
+            (
+                mean(color),
+                mean(photo_color),
+                if count > 0.0 { depth } else { f32::NAN },
+            )
         };
         let blocks: Vec<([f32; 3], [f32; 3], f32)> = (0..grid.len()).into_par_iter().map(block).collect();
         // The difference of the photograph as a whole is its exposure.
@@ -136,7 +141,7 @@ impl Difference {
             let mut values: Vec<f32> = blocks.iter().map(|(color, ..)| color[c]).collect();
             quantile(&mut values, 0.5).unwrap_or(0.0)
         });
-        let beyond = |(color, ..): &([f32; 3], [f32; 3], f32)| {
+        let max_difference = |(color, ..): &([f32; 3], [f32; 3], f32)| {
             let difference = |c: usize| (color[c] - whole[c]).abs();
             // NaN in one channel is NaN in all, and `max` would drop it.
             difference(0)
@@ -147,10 +152,10 @@ impl Difference {
         Self {
             camera: *camera,
             grid,
-            color: blocks.iter().map(beyond).collect(),
+            color: blocks.iter().map(max_difference).collect(),
             photo: blocks
                 .iter()
-                .map(|(_, shown, _)| std::array::from_fn(|c| shown[c] - whole[c]))
+                .map(|(_, photo_color, _)| std::array::from_fn(|c| photo_color[c] - whole[c]))
                 .collect(),
             depth: blocks.iter().map(|(.., depth)| *depth).collect(),
         }
@@ -178,7 +183,7 @@ impl Difference {
         let column = Grid::block(x as usize, self.grid.columns, k.width as usize);
         let row = Grid::block(y as usize, self.grid.rows, k.height as usize);
         let block = row * self.grid.columns + column;
-        ((self.depth[block] / depth - 1.0).abs() < SAME_DEPTH).then_some(block)
+        ((self.depth[block] / depth - 1.0).abs() < DEPTH_TOLERANCE).then_some(block)
     }
 }
 
@@ -204,7 +209,7 @@ impl Hidden {
                 .map(|(i, (_, other))| (own.camera.pose.distance(&other.camera.pose, extent), i))
                 .collect();
             others.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-            others.truncate(WITNESSES);
+            others.truncate(MAX_WITNESSES);
             let excess = |i: usize| {
                 let place = own.place(i);
                 let witness = |(_, other): &(f32, usize)| {
@@ -212,15 +217,16 @@ impl Hidden {
                     let block = difference.sees(place)?;
                     (!already.contains(*view, block)).then_some((difference.color[block], difference.photo[block]))
                 };
-                let (mut seen, shown): (Vec<f32>, Vec<[f32; 3]>) = others.iter().filter_map(witness).unzip();
-                if seen.len() < MIN_WITNESSES {
+                let (mut differences, colors): (Vec<f32>, Vec<[f32; 3]>) = others.iter().filter_map(witness).unzip();
+                if differences.len() < MIN_WITNESSES {
                     return 0.0;
                 }
                 // A veil in front of this camera makes its frame differ, but the photograph still looks like the others.
-                let usual = |c: usize| quantile(&mut shown.iter().map(|color| color[c]).collect(), 0.5);
-                let unlike = (0..3).filter_map(|c| Some((own.photo[i][c] - usual(c)?).abs()));
-                let least = LEAST.max(FACTOR * quantile(&mut seen, WITNESS_QUANTILE).unwrap_or(0.0));
-                (own.color[i] / least).min(unlike.fold(0.0, f32::max) / LEAST)
+                let median = |c: usize| quantile(&mut colors.iter().map(|color| color[c]).collect(), 0.5);
+                let color_differences = (0..3).filter_map(|c| Some((own.photo[i][c] - median(c)?).abs()));
+                let threshold =
+                    MIN_DIFFERENCE.max(MIN_FACTOR * quantile(&mut differences, WITNESS_QUANTILE).unwrap_or(0.0));
+                (own.color[i] / threshold).min(color_differences.fold(0.0, f32::max) / MIN_DIFFERENCE)
             };
             let excess: Vec<f32> = (0..own.grid.len()).map(excess).collect();
             (*view, patches(own.grid, &excess))
@@ -290,8 +296,8 @@ impl Hidden {
     }
 }
 
-/// Marks patches of connected blocks with an `excess` of at least [`GROW`], of which at least [`MIN_BLOCKS`] have one of at least 1, and
-/// the blocks around them.
+/// Marks patches of connected blocks with an `excess` of at least [`GROWTH_THRESHOLD`], of which at least [`MIN_BLOCKS`] have one of at
+/// least 1, and the blocks around them.
 fn patches(grid: Grid, excess: &[f32]) -> Vec<bool> {
     let mut is_hidden = vec![false; excess.len()];
     let mut is_visited = vec![false; excess.len()];
@@ -304,7 +310,7 @@ fn patches(grid: Grid, excess: &[f32]) -> Vec<bool> {
         while let Some(block) = patch.get(next).copied() {
             next += 1;
             for near in grid.around(block) {
-                if excess[near] >= GROW && !is_visited[near] {
+                if excess[near] >= GROWTH_THRESHOLD && !is_visited[near] {
                     is_visited[near] = true;
                     patch.push(near);
                 }
@@ -316,7 +322,7 @@ fn patches(grid: Grid, excess: &[f32]) -> Vec<bool> {
         }
     }
     let count = is_hidden.iter().filter(|hidden| **hidden).count();
-    if count as f32 > MOST * excess.len() as f32 {
+    if count as f32 > MAX_HIDDEN_FRACTION * excess.len() as f32 {
         is_hidden.fill(false);
     }
     is_hidden

@@ -5,10 +5,10 @@ import { add, axes, clamp, dot, length, mix, multiply, rotate, scale, slerp, sub
 import { LocalRenderer } from "irradia/renderer.js";
 
 /** Radians per pixel of dragging, and the largest angle between the view and the horizon. */
-const TURN = 0.006;
-const STEEPEST = 1.54;
+const RADIANS_PER_PIXEL = 0.006;
+const MAX_ELEVATION = 1.54;
 /** Largest number of device pixels per CSS pixel. */
-const DENSITY = 2;
+const MAX_DENSITY = 2;
 
 const stage = /** @type {HTMLElement} */ (document.getElementById("stage"));
 const message = /** @type {HTMLElement} */ (document.getElementById("message"));
@@ -27,7 +27,7 @@ Object.assign(window, { irradia: { renderer, camera: () => camera, set: (to) => 
 
 /** Pixels and focal length: the picture shows at least as much in width and height as at the start. */
 function intrinsics() {
-  const density = Math.min(devicePixelRatio || 1, DENSITY);
+  const density = Math.min(devicePixelRatio || 1, MAX_DENSITY);
   const [width, height] = [Math.max(1, Math.round(stage.clientWidth * density)), Math.max(1, Math.round(stage.clientHeight * density))];
   const vertical = height / 2 / Math.tan(camera.fov / 2);
   const focal = Math.min(vertical, (vertical * width) / height / view.aspect);
@@ -38,10 +38,10 @@ const reach = () => Math.max(length(subtract(pivot, camera.position)), 0.02 * vi
 
 /** Turns about the pivot. @param {number} dx @param {number} dy pixels */
 function orbit(dx, dy) {
-  const yaw = turn(up, -dx * TURN);
+  const yaw = turn(up, -dx * RADIANS_PER_PIXEL);
   const [right, , ahead] = axes(camera.rotation);
   const elevation = Math.asin(clamp(dot(ahead, up), -1, 1));
-  const pitch = clamp(-dy * TURN, Math.min(0, -STEEPEST - elevation), Math.max(0, STEEPEST - elevation));
+  const pitch = clamp(-dy * RADIANS_PER_PIXEL, Math.min(0, -MAX_ELEVATION - elevation), Math.max(0, MAX_ELEVATION - elevation));
   const both = multiply(yaw, turn(right, pitch));
   const rotation = unit(multiply(both, camera.rotation));
   const position = add(pivot, rotate(both, subtract(camera.position, pivot)));
@@ -52,7 +52,7 @@ function orbit(dx, dy) {
 /** Moves camera and pivot across the view. @param {number} dx @param {number} dy pixels */
 function pan(dx, dy) {
   const [right, down] = axes(camera.rotation);
-  const step = reach() / intrinsics().fy * Math.min(devicePixelRatio || 1, DENSITY);
+  const step = reach() / intrinsics().fy * Math.min(devicePixelRatio || 1, MAX_DENSITY);
   const move = add(scale(right, -dx * step), scale(down, -dy * step));
   pivot = add(pivot, move);
   camera = { ...camera, position: add(camera.position, move) };

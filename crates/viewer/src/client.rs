@@ -1,12 +1,13 @@
-//! The socket of one page: takes its requests to the desk, and sends it pictures and news.
+//! The socket of one page: passes its requests to the scheduler, and sends it pictures and news.
 
 use crate::Subject;
-use crate::desk::{Out, SEATS, Task};
-use crate::live::Known;
+use crate::live::ReportCursor;
 use crate::message::Request;
+use crate::scheduler::{MAX_CLIENTS, OutMessage, Task};
 use crate::serve::{Shared, downloads};
 use crate::subject::Edition;
 use axum::extract::ws::{CloseFrame, Message, WebSocket};
+use irradia_edit::Transform;
 use irradia_train::model::Model;
 use serde_json::{Value, json};
 use std::sync::Arc;
@@ -15,25 +16,25 @@ use tokio::sync::{mpsc, watch};
 use tokio::time::{MissedTickBehavior, interval, timeout};
 
 /// Maximum number of messages that wait for a page.
-const OUTBOX: usize = 8;
+const OUTBOX_CAPACITY: usize = 8;
 /// Maximum number of requests per second; a page with a moving camera sends one per frame of its screen.
-const RATE: f32 = 500.0;
+const MAX_REQUESTS_PER_SECOND: f32 = 500.0;
 /// Number of requests beyond the rate or unreadable after which a page is disconnected.
-const PATIENCE: u32 = 200;
+const MAX_FAULTS: u32 = 200;
 /// Time in which a page must accept a message.
-const TAKES: Duration = Duration::from_secs(20);
+const SEND_TIMEOUT: Duration = Duration::from_secs(20);
 /// Interval of news about a training.
-const NEWS: Duration = Duration::from_millis(250);
+const NEWS_INTERVAL: Duration = Duration::from_millis(250);
 
-/// Frees the seat however the task ends.
-struct Seat(Arc<Shared>, u64);
+/// Disconnects the client however the task ends.
+struct ClientGuard(Arc<Shared>, u64);
 
-impl Drop for Seat {
+impl Drop for ClientGuard {
     fn drop(&mut self) {
-        let Self(shared, seat) = self;
-        shared.desk.leave(*seat);
+        let Self(shared, client) = self;
+        shared.scheduler.disconnect(*client);
         if let Some(live) = &shared.subject.live
-            && shared.desk.len() == 0
+            && shared.scheduler.len() == 0
         {
             live.set_due(None);
         }
@@ -42,29 +43,29 @@ impl Drop for Seat {
 
 /// Serves a page until it leaves or misbehaves.
 pub(crate) async fn serve(mut socket: WebSocket, shared: Arc<Shared>) {
-    let (outbox, mut inbox) = mpsc::channel(OUTBOX);
-    let Some(seat) = shared.desk.sit(outbox) else {
-        shared.notices.once(
+    let (outbox, mut inbox) = mpsc::channel(OUTBOX_CAPACITY);
+    let Some(client) = shared.scheduler.connect(outbox) else {
+        shared.notices.report_once(
             "seats",
-            format_args!("more than {SEATS} pages: further ones are rejected"),
+            format_args!("more than {MAX_CLIENTS} pages: further ones are rejected"),
         );
         let reason = CloseFrame {
             code: 1013,
             reason: "there are too many pages".into(),
         };
-        let _ = timeout(TAKES, socket.send(Message::Close(Some(reason)))).await;
+        let _ = timeout(SEND_TIMEOUT, socket.send(Message::Close(Some(reason)))).await;
         return;
     };
-    let seat = Seat(shared.clone(), seat);
+    let client = ClientGuard(shared.clone(), client);
     if let Some(live) = &shared.subject.live {
-        live.look();
+        live.page_opened();
     }
-    let mut known = Known::default();
+    let mut cursor = ReportCursor::default();
     let (mut version, mut reported) = (0, Value::Null);
-    let mut news = interval(NEWS);
+    let mut news = interval(NEWS_INTERVAL);
     news.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut edits = shared.subject.editing.as_ref().ok().map(|editing| editing.watch());
-    let mut allowance = Allowance::new();
+    let mut limiter = RateLimiter::new();
     if !send(&mut socket, Message::text(hello(&shared).to_string())).await {
         return;
     }
@@ -74,50 +75,50 @@ pub(crate) async fn serve(mut socket: WebSocket, shared: Arc<Shared>) {
     loop {
         tokio::select! {
             message = socket.recv() => match message {
-                Some(Ok(message)) => match handle(&shared, seat.1, message, &mut allowance) {
-                    Handled::Fine => {}
-                    Handled::Left => return,
-                    Handled::SentAway(why) => {
-                        shared.notices.once(why, format_args!("a page was disconnected: {why}"));
+                Some(Ok(message)) => match handle(&shared, client.1, message, &mut limiter) {
+                    Outcome::Continue => {}
+                    Outcome::Closed => return,
+                    Outcome::Rejected(why) => {
+                        shared.notices.report_once(why, format_args!("a page was disconnected: {why}"));
                         let reason = CloseFrame { code: 1008, reason: why.into() };
                         send(&mut socket, Message::Close(Some(reason))).await;
                         return;
                     }
                 },
                 Some(Err(_)) => {
-                    shared.notices.once("socket", "a page broke the protocol of its socket, or was cut off");
+                    shared.notices.report_once("socket", "a page broke the protocol of its socket, or was cut off");
                     return;
                 }
                 None => return,
             },
             Some(out) = inbox.recv() => {
                 let message = match out {
-                    Out::Text(text) => Message::text(text),
-                    Out::Binary(bytes) => Message::binary(bytes),
+                    OutMessage::Text(text) => Message::text(text),
+                    OutMessage::Binary(bytes) => Message::binary(bytes),
                 };
                 if !send(&mut socket, message).await {
                     return;
                 }
             }
-            Some(told) = changed(&mut edits) => {
+            Some(state) = next_edit_state(&mut edits) => {
                 // The scene first: the selection is one of its splats.
-                for text in fresh_scene(&shared, &mut version).iter().chain([&*told]) {
+                for text in changed_scene(&shared, &mut version).iter().chain([&*state]) {
                     if !send(&mut socket, Message::text(text.to_string())).await {
                         return;
                     }
                 }
             }
             _ = news.tick() => {
-                let mut told = Vec::new();
+                let mut messages = Vec::new();
                 if let Some(live) = &shared.subject.live {
-                    let report = live.report(&mut known);
+                    let report = live.report(&mut cursor);
                     if report != reported {
-                        told.push(report.clone());
+                        messages.push(report.clone());
                         reported = report;
                     }
                 }
-                told.extend(fresh_scene(&shared, &mut version));
-                for text in told {
+                messages.extend(changed_scene(&shared, &mut version));
+                for text in messages {
                     if !send(&mut socket, Message::text(text.to_string())).await {
                         return;
                     }
@@ -128,7 +129,7 @@ pub(crate) async fn serve(mut socket: WebSocket, shared: Arc<Shared>) {
 }
 
 /// Waits for the next state of the editing session; for ever if there is none.
-async fn changed(edits: &mut Option<watch::Receiver<Arc<Value>>>) -> Option<Arc<Value>> {
+async fn next_edit_state(edits: &mut Option<watch::Receiver<Arc<Value>>>) -> Option<Arc<Value>> {
     if let Some(edits) = edits
         && edits.changed().await.is_ok()
     {
@@ -138,7 +139,7 @@ async fn changed(edits: &mut Option<watch::Receiver<Arc<Value>>>) -> Option<Arc<
 }
 
 /// The scene, if its splats are not those of `version`, which is updated.
-fn fresh_scene(shared: &Shared, version: &mut u64) -> Option<Value> {
+fn changed_scene(shared: &Shared, version: &mut u64) -> Option<Value> {
     let edition = shared.subject.edition()?;
     if edition.splats_version == *version {
         return None;
@@ -149,79 +150,80 @@ fn fresh_scene(shared: &Shared, version: &mut u64) -> Option<Value> {
 
 /// Sends `message`; returns whether the page accepted it in time.
 async fn send(socket: &mut WebSocket, message: Message) -> bool {
-    matches!(timeout(TAKES, socket.send(message)).await, Ok(Ok(())))
+    matches!(timeout(SEND_TIMEOUT, socket.send(message)).await, Ok(Ok(())))
 }
 
-enum Handled {
-    Fine,
-    Left,
-    SentAway(&'static str),
+enum Outcome {
+    Continue,
+    Closed,
+    Rejected(&'static str),
 }
 
 /// Limits the rate of requests and the number of faults.
-struct Allowance {
-    left: f32,
+struct RateLimiter {
+    tokens: f32,
     at: Instant,
     faults: u32,
 }
 
-impl Allowance {
+impl RateLimiter {
     fn new() -> Self {
         Self {
-            left: RATE,
+            tokens: MAX_REQUESTS_PER_SECOND,
             at: Instant::now(),
             faults: 0,
         }
     }
 
     /// Counts a request; returns whether it is within the rate.
-    fn take(&mut self) -> bool {
+    fn try_acquire(&mut self) -> bool {
         let now = Instant::now();
-        self.left = (self.left + RATE * now.duration_since(self.at).as_secs_f32()).min(RATE);
+        self.tokens = (self.tokens + MAX_REQUESTS_PER_SECOND * now.duration_since(self.at).as_secs_f32())
+            .min(MAX_REQUESTS_PER_SECOND);
         self.at = now;
-        self.left -= 1.0;
-        self.left >= 0.0
+        self.tokens -= 1.0;
+        self.tokens >= 0.0
     }
 
-    fn fault(&mut self, why: &'static str) -> Handled {
+    fn fault(&mut self, why: &'static str) -> Outcome {
         self.faults += 1;
-        if self.faults > PATIENCE {
-            Handled::SentAway(why)
+        if self.faults > MAX_FAULTS {
+            Outcome::Rejected(why)
         } else {
-            Handled::Fine
+            Outcome::Continue
         }
     }
 }
 
-fn handle(shared: &Shared, seat: u64, message: Message, allowance: &mut Allowance) -> Handled {
-    if !allowance.take() {
-        return allowance.fault("too many requests");
+fn handle(shared: &Shared, client: u64, message: Message, limiter: &mut RateLimiter) -> Outcome {
+    if !limiter.try_acquire() {
+        return limiter.fault("too many requests");
     }
     let text = match &message {
         Message::Text(text) => text.as_str(),
-        Message::Binary(_) => return allowance.fault("binary requests"),
-        Message::Close(_) => return Handled::Left,
-        Message::Ping(_) | Message::Pong(_) => return Handled::Fine,
+        Message::Binary(_) => return limiter.fault("binary requests"),
+        Message::Close(_) => return Outcome::Closed,
+        Message::Ping(_) | Message::Pong(_) => return Outcome::Continue,
     };
     let Ok(request) = serde_json::from_str::<Request>(text) else {
-        return allowance.fault("requests that cannot be read");
+        return limiter.fault("requests that cannot be read");
     };
-    let (desk, subject) = (&shared.desk, &shared.subject);
+    let (scheduler, subject) = (&shared.scheduler, &shared.subject);
     match request {
         Request::Shot(raw) => match raw.check() {
-            Some(shot) => desk.want(seat, Some(shot)),
-            None => return allowance.fault("cameras that cannot be drawn"),
+            Some(shot) => scheduler.request_picture(client, Some(shot)),
+            None => return limiter.fault("cameras that cannot be drawn"),
         },
-        Request::Rest => desk.want(seat, None),
-        Request::Shown { id } => desk.shown(seat, id),
+        Request::Rest => scheduler.request_picture(client, None),
+        Request::Shown { id } => scheduler.acknowledge(client, id),
         Request::Pick { x, y, tag, shot } => {
             let tag = tag.chars().take(64).collect();
-            desk.ask(seat, Task::Pick { x, y, tag, shot });
+            scheduler.add_job(client, Task::Pick { x, y, tag, shot });
         }
-        Request::Scores => desk.score(seat, subject.views.0.len()),
+        Request::Scores => scheduler.request_scores(client, subject.views.0.len()),
         Request::Train { action } => {
             if let Some(live) = &subject.live {
-                live.act(action);
+                live.apply(action);
             }
         }
         Request::Edit(request) => {
@@ -229,30 +231,30 @@ fn handle(shared: &Shared, seat: u64, message: Message, allowance: &mut Allowanc
                 Err(why) => Some((*why).to_owned()),
                 Ok(editing) => match request.check() {
                     Err(error) => Some(error.to_string()),
-                    Ok(()) if editing.ask(seat, request) => None,
+                    Ok(()) if editing.push(client, request) => None,
                     Ok(()) => Some("too many edits are waiting: try again when they are done".to_owned()),
                 },
             };
             if let Some(why) = refused {
-                desk.tell(seat, json!({ "tell": "problem", "text": why }).to_string());
+                scheduler.send_text(client, json!({ "tell": "problem", "text": why }).to_string());
             }
         }
         Request::Unit { metres } => {
             let folder = subject.folder.as_ref();
-            let kept = folder.map(|folder| folder.set_metres_per_unit(metres * scale_of(subject)));
-            let told = match kept {
+            let kept = folder.map(|folder| folder.set_metres_per_unit(metres * edit_scale(subject)));
+            let reply = match kept {
                 Some(Ok(())) => json!({ "tell": "unit", "metres": metres }),
                 Some(Err(error)) => json!({ "tell": "problem", "text": error.to_string() }),
                 None => json!({ "tell": "problem", "text": "the scale can only be saved in the folder of a run" }),
             };
-            desk.tell(seat, told.to_string());
+            scheduler.send_text(client, reply.to_string());
         }
     }
-    Handled::Fine
+    Outcome::Continue
 }
 
 /// The factor by which edits have scaled the whole scene: the unit saved in the run is that before the edits.
-fn scale_of(subject: &Subject) -> f64 {
+fn edit_scale(subject: &Subject) -> f64 {
     subject.edition().map_or(1.0, |edition| edition.placement.scale)
 }
 
@@ -269,7 +271,7 @@ fn hello(shared: &Shared) -> Value {
         "plan": subject.live.as_ref().map(|live| live.plan()),
         "recipe": subject.recipe,
         "id": shared.id,
-        "metres": subject.folder.as_ref().and_then(|folder| folder.metres_per_unit()).map(|metres| metres / scale_of(subject)),
+        "metres": subject.folder.as_ref().and_then(|folder| folder.metres_per_unit()).map(|metres| metres / edit_scale(subject)),
         "keeps_unit": subject.folder.is_some(),
         "warnings": subject.warnings,
         "editing": { "works": subject.editing.is_ok(), "why": subject.editing.as_ref().err() },
@@ -281,9 +283,9 @@ fn hello(shared: &Shared) -> Value {
 /// The message that describes a version of the scene.
 fn scene(edition: &Edition) -> Value {
     let scene = edition.scene();
-    let outlook = scene.outlook();
-    let k = outlook.intrinsics;
-    let rotation = edition.placement.rotation;
+    let orbit_geometry = scene.orbit_geometry();
+    let k = orbit_geometry.intrinsics;
+    let first = scene.cameras.as_deref().and_then(|cameras| cameras.first());
     let (kind, count, sh_degree) = match &scene.model {
         Model::Splats { splats, residual: None } => {
             ("splats", splats.len(), scene.options.sh_degree.min(splats.sh_degree()))
@@ -294,11 +296,8 @@ fn scene(edition: &Edition) -> Value {
     json!({
         "tell": "scene",
         "version": edition.splats_version,
-        "placement": {
-            "scale": edition.placement.scale,
-            "rotation": [rotation.w, rotation.x, rotation.y, rotation.z],
-            "translation": edition.placement.translation.to_array(),
-        },
+        "placement": transform(&edition.placement),
+        "world_from_photographs": transform(&edition.world_from_photographs()),
         // To the coordinates of the dataset.
         "world": { "scale": scene.world_from_dataset.scale, "center": scene.world_from_dataset.center.to_array() },
         "step": edition.step(),
@@ -310,10 +309,22 @@ fn scene(edition: &Edition) -> Value {
         "antialias": scene.options.antialias,
         "lights": edition.lights.is_some(),
         "background": scene.options.background,
-        "center": outlook.center.to_array(),
-        "up": outlook.up.to_array(),
-        "radius": outlook.radius,
-        "height": outlook.height,
+        "center": orbit_geometry.center.to_array(),
+        "up": orbit_geometry.up.to_array(),
+        "radius": orbit_geometry.radius,
+        "height": orbit_geometry.height,
+        // The side from which a page first sees the scene, as an orbit does.
+        "first": first.map(|camera| camera.pose.position.to_array()),
         "fov": 2.0 * (0.5 * k.height as f32 / k.fy).atan(),
+    })
+}
+
+/// A transform in the form that the page reads.
+fn transform(transform: &Transform) -> Value {
+    let rotation = transform.rotation;
+    json!({
+        "scale": transform.scale,
+        "rotation": [rotation.w, rotation.x, rotation.y, rotation.z],
+        "translation": transform.translation.to_array(),
     })
 }

@@ -17,23 +17,23 @@ use rayon::prelude::*;
 use std::borrow::Cow;
 
 /// Splats per block: of 500,000 the first block is 1.6 %.
-pub(crate) const BLOCK: usize = 8192;
+pub(crate) const BLOCK_SPLATS: usize = 8192;
 /// Levels of detail for which the header has room.
-const LEVELS: usize = 3;
+const MAX_LEVELS: usize = 3;
 /// Bytes of the header.
-const HEADER: usize = 32;
+const HEADER_BYTES: usize = 32;
 /// Bytes of a splat without its higher bands.
-const CORE: usize = 32;
+const CORE_BYTES: usize = 32;
 
 /// Bytes of the bands above 0 of a splat, a multiple of 16.
 pub(crate) const fn band_bytes(degree: u32) -> usize {
     16 * degree as usize
 }
 
-/// `splats` in compact form, with bands up to `degree`, the `most` important of them. Splats that can never be seen are left out.
-pub(crate) fn compact(splats: &Splats, degree: u32, most: usize) -> Vec<u8> {
+/// `splats` in compact form, with bands up to `degree`, the `max_splats` important of them. Splats that can never be seen are left out.
+pub(crate) fn compact(splats: &Splats, degree: u32, max_splats: usize) -> Vec<u8> {
     let mut order = by_importance(splats);
-    order.truncate(most);
+    order.truncate(max_splats);
     compact_in_order(splats, degree, &order, &[])
 }
 
@@ -41,12 +41,15 @@ pub(crate) fn compact(splats: &Splats, degree: u32, most: usize) -> Vec<u8> {
 pub(crate) fn compact_in_order(splats: &Splats, degree: u32, order: &[u32], levels: &[Splats]) -> Vec<u8> {
     let degree = degree.min(splats.sh_degree());
     let mut parts = vec![(splats, Cow::Borrowed(order))];
-    let levels = levels.iter().filter(|level| level.sh_degree() >= degree).take(LEVELS);
+    let levels = levels
+        .iter()
+        .filter(|level| level.sh_degree() >= degree)
+        .take(MAX_LEVELS);
     parts.extend(levels.map(|level| (level, Cow::Owned(by_importance(level)))));
-    let mut bytes = vec![0; HEADER];
+    let mut bytes = vec![0; HEADER_BYTES];
     bytes[..4].copy_from_slice(b"IRS1");
     let counts: Vec<u32> = parts.iter().map(|(_, order)| order.len() as u32).collect();
-    let words = [&[counts[0], degree, BLOCK as u32], &counts[1..]].concat();
+    let words = [&[counts[0], degree, BLOCK_SPLATS as u32], &counts[1..]].concat();
     for (at, value) in words.into_iter().enumerate() {
         bytes[4 + 4 * at..][..4].copy_from_slice(&value.to_le_bytes());
     }
@@ -59,13 +62,13 @@ pub(crate) fn compact_in_order(splats: &Splats, degree: u32, order: &[u32], leve
 fn write_blocks(splats: &Splats, degree: u32, order: &[u32], bytes: &mut Vec<u8>) {
     let band = band_bytes(degree);
     let start = bytes.len();
-    bytes.resize(start + order.len() * (CORE + band), 0);
+    bytes.resize(start + order.len() * (CORE_BYTES + band), 0);
     bytes[start..]
-        .par_chunks_mut(BLOCK * (CORE + band))
-        .zip(order.par_chunks(BLOCK))
+        .par_chunks_mut(BLOCK_SPLATS * (CORE_BYTES + band))
+        .zip(order.par_chunks(BLOCK_SPLATS))
         .for_each(|(to, order)| {
-            let (cores, bands) = to.split_at_mut(order.len() * CORE);
-            for (to, i) in cores.chunks_exact_mut(CORE).zip(order) {
+            let (cores, bands) = to.split_at_mut(order.len() * CORE_BYTES);
+            for (to, i) in cores.chunks_exact_mut(CORE_BYTES).zip(order) {
                 write_core(splats, *i as usize, to);
             }
             if band > 0 {
@@ -173,10 +176,10 @@ mod tests {
         let bytes = compact(&splats, 3, usize::MAX);
         let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().expect("four"));
         assert_eq!((&bytes[..4], word(4), word(8)), (&b"IRS1"[..], 2, 1));
-        assert_eq!(bytes.len(), HEADER + 2 * (CORE + 16));
-        let x = |splat: usize| f32::from_bits(word(HEADER + splat * CORE));
+        assert_eq!(bytes.len(), HEADER_BYTES + 2 * (CORE_BYTES + 16));
+        let x = |splat: usize| f32::from_bits(word(HEADER_BYTES + splat * CORE_BYTES));
         assert_eq!((x(0), x(1)), (2.0, 3.0));
-        let band = &bytes[HEADER + 2 * CORE..];
+        let band = &bytes[HEADER_BYTES + 2 * CORE_BYTES..];
         let factor = from_half(u16::from_le_bytes([band[0], band[1]]));
         for n in 0..9 {
             let value = f32::from(band[2 + n] as i8) / 127.0 * factor;
@@ -184,12 +187,12 @@ mod tests {
         }
         let with_level = compact_in_order(&splats, 3, &[2, 3], &[splats.gather(&[3])]);
         let at = bytes.len();
-        assert_eq!(with_level.len(), at + CORE + 16);
+        assert_eq!(with_level.len(), at + CORE_BYTES + 16);
         assert_eq!(
             (&with_level[16..20], &with_level[20..28]),
             (&1u32.to_le_bytes()[..], &[0; 8][..])
         );
-        assert_eq!(with_level[HEADER..at], bytes[HEADER..]);
+        assert_eq!(with_level[HEADER_BYTES..at], bytes[HEADER_BYTES..]);
         assert_eq!(with_level[at..at + 4], 3f32.to_le_bytes());
     }
 }

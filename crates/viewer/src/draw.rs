@@ -1,9 +1,9 @@
-//! The drawing thread: takes one task after another from the desk.
+//! The drawing thread: takes one task after another from the scheduler.
 
-use crate::desk::{Desk, Now, Task};
 use crate::message::{PictureHeader, Shot, picture};
 use crate::pace::Detail;
 use crate::paint::{Painter, Picture};
+use crate::scheduler::{SceneStatus, Scheduler, Task};
 use crate::subject::{Edition, Subject};
 use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
 use serde_json::json;
@@ -16,33 +16,42 @@ const SHARP_QUALITY: u8 = 96;
 /// Bytes of splats copied per second, to estimate the time that a training loses by a copy.
 const COPY_RATE: f32 = 1.5e9;
 
-/// Draws until the desk closes.
-pub(crate) fn draw(subject: &Subject, desk: &Desk) {
+/// Draws until the scheduler closes.
+pub(crate) fn draw(subject: &Subject, scheduler: &Scheduler) {
     let mut painter = Painter::default();
     // The version whose successor has been requested.
     let mut renewed = 0;
-    let now = || Now {
+    let now = || SceneStatus {
         version: subject.edition().map_or(0, |edition| edition.version),
         training: subject.live.as_ref().is_some_and(|live| live.is_training()),
     };
-    while let Some((seat, task)) = desk.next(now) {
+    while let Some((client, task)) = scheduler.next(now) {
         let Some(edition) = subject.edition() else { continue };
         match task {
             Task::Picture { shot, detail } => {
-                draw_picture(subject, desk, &mut painter, &edition, seat, &shot, detail, &mut renewed);
+                draw_picture(
+                    subject,
+                    scheduler,
+                    &mut painter,
+                    &edition,
+                    client,
+                    &shot,
+                    detail,
+                    &mut renewed,
+                );
             }
             Task::Pick { x, y, tag, shot } => {
                 if let Some(shot) = shot.check() {
                     let picked = painter.pick(&edition, &shot, x, y, tag);
-                    let mut told = serde_json::to_value(&picked).expect("plain data");
-                    told["tell"] = "picked".into();
-                    desk.tell(seat, told.to_string());
+                    let mut message = serde_json::to_value(&picked).expect("plain data");
+                    message["tell"] = "picked".into();
+                    scheduler.send_text(client, message.to_string());
                 }
             }
             Task::Score { view } => {
                 let psnr = painter.score(&edition, view, &subject.views.0[view]);
-                let told = json!({ "tell": "score", "view": view, "psnr": psnr, "step": edition.step() });
-                desk.tell(seat, told.to_string());
+                let message = json!({ "tell": "score", "view": view, "psnr": psnr, "step": edition.step() });
+                scheduler.send_text(client, message.to_string());
             }
         }
     }
@@ -50,10 +59,10 @@ pub(crate) fn draw(subject: &Subject, desk: &Desk) {
 
 fn draw_picture(
     subject: &Subject,
-    desk: &Desk,
+    scheduler: &Scheduler,
     painter: &mut Painter,
     edition: &Edition,
-    seat: u64,
+    client: u64,
     shot: &Shot,
     detail: Detail,
     renewed: &mut u64,
@@ -76,7 +85,7 @@ fn draw_picture(
             ..*shot
         },
     };
-    let wanted = || desk.is_wanted(seat, shot);
+    let wanted = || scheduler.is_current(client, shot);
     let Some(drawn) = painter.paint(edition, &shot_drawn, &detail, (k.width, k.height), view, &wanted) else {
         return;
     };
@@ -93,16 +102,16 @@ fn draw_picture(
     };
     let pixels = drawn.width as f32 * drawn.height as f32;
     let bytes = picture(&header, &jpeg);
-    desk.deliver(seat, shot, detail, bytes, pixels, seconds, edition.version);
+    scheduler.deliver(client, shot, detail, bytes, pixels, seconds, edition.version);
     if let Some(live) = &subject.live {
         let seconds = opened.elapsed().as_secs_f32();
         if detail.moving {
-            desk.rest(seconds);
+            scheduler.pause_drawing(seconds);
         }
         if *renewed < edition.version {
             *renewed = edition.version;
             let copied = edition.scene().model.splats().map_or(0, |splats| splats.bytes());
-            live.set_due(desk.renewal(seconds, copied as f32 / COPY_RATE));
+            live.set_due(scheduler.schedule_renewal(seconds, copied as f32 / COPY_RATE));
         }
     }
 }

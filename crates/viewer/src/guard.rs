@@ -11,9 +11,9 @@ use axum::http::{HeaderMap, Method, Uri};
 use std::net::IpAddr;
 
 /// Name of the cookie, and of the parameter in the address.
-pub const TOKEN: &str = "token";
+pub const TOKEN_NAME: &str = "token";
 /// Path to which pages send scenes.
-pub const UPLOADS: &str = "/merge/";
+pub const UPLOAD_PATH: &str = "/merge/";
 
 /// Why a request is refused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -54,13 +54,13 @@ pub(crate) struct Guard {
 impl Guard {
     /// Checks one request.
     pub fn check(&self, method: &Method, uri: &Uri, headers: &HeaderMap) -> Result<Entry, Refusal> {
-        let sends = method == Method::POST && uri.path().starts_with(UPLOADS);
+        let sends = method == Method::POST && uri.path().starts_with(UPLOAD_PATH);
         if method != Method::GET && !sends {
             return Err(Refusal::Method);
         }
         let text = |name: &str| headers.get(name).and_then(|value| value.to_str().ok());
         let host = text(HOST.as_str()).ok_or(Refusal::Host)?;
-        if headers.get_all(HOST).iter().count() != 1 || !self.is_ours(host) {
+        if headers.get_all(HOST).iter().count() != 1 || !self.is_own_host(host) {
             return Err(Refusal::Host);
         }
         match headers.get(ORIGIN) {
@@ -80,7 +80,7 @@ impl Guard {
         let query = uri.query().unwrap_or_default().split('&');
         let in_address = query
             .filter_map(|pair| pair.split_once('='))
-            .any(|(name, value)| name == TOKEN && same(value, token));
+            .any(|(name, value)| name == TOKEN_NAME && constant_time_eq(value, token));
         if in_address {
             return Ok(Entry::ByAddress);
         }
@@ -88,14 +88,14 @@ impl Guard {
         let mut pairs = cookies
             .flat_map(|line| line.split(';'))
             .filter_map(|pair| pair.trim().split_once('='));
-        match pairs.any(|(name, value)| name == TOKEN && same(value, token)) {
+        match pairs.any(|(name, value)| name == TOKEN_NAME && constant_time_eq(value, token)) {
             true => Ok(Entry::Plain),
             false => Err(Refusal::Token),
         }
     }
 
     /// Whether `host`, with or without a port, names this server. The port may be that of a tunnel.
-    fn is_ours(&self, host: &str) -> bool {
+    fn is_own_host(&self, host: &str) -> bool {
         let name = match host.rsplit_once(':') {
             Some((name, port)) if port.parse::<u16>().is_ok() && !name.ends_with(':') => name,
             _ => host,
@@ -113,7 +113,7 @@ impl Guard {
 }
 
 /// Compares in a time that does not depend on how many bytes are equal.
-fn same(a: &str, b: &str) -> bool {
+fn constant_time_eq(a: &str, b: &str) -> bool {
     a.len() == b.len()
         && a.bytes()
             .zip(b.bytes())

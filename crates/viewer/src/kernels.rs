@@ -1,6 +1,6 @@
 //! The program's own compute shaders, for pages that draw with WebGPU.
 
-use irradia_splat::shaders::of_a_frame;
+use irradia_splat::shaders::frame_shaders;
 use serde_json::json;
 use std::sync::LazyLock;
 
@@ -16,7 +16,7 @@ pub(crate) fn kernels() -> &'static str {
                 parts.len() - 1
             })
         };
-        let kernels: serde_json::Map<_, _> = of_a_frame()
+        let kernels: serde_json::Map<_, _> = frame_shaders()
             .map(|shader| {
                 let numbers: Vec<usize> = shader.parts.iter().map(|part| number(part)).collect();
                 (shader.name.to_owned(), json!(numbers))
@@ -58,7 +58,7 @@ mod tests {
 
     #[test]
     fn the_page_binds_what_kernels_have() {
-        for shader in of_a_frame() {
+        for shader in frame_shaders() {
             let bindings = shader.source().matches("@binding(").count();
             assert_eq!(bound(shader.name), bindings, "{}", shader.name);
         }
@@ -74,7 +74,7 @@ mod tests {
     #[test]
     fn parts_make_the_kernels_again() {
         let value: serde_json::Value = serde_json::from_str(kernels()).expect("JSON");
-        let shaders: Vec<_> = of_a_frame().collect();
+        let shaders: Vec<_> = frame_shaders().collect();
         assert_eq!(shaders.len(), 13);
         for shader in shaders {
             let numbers = value["kernels"][shader.name].as_array().expect("numbers");

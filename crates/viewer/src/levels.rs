@@ -8,11 +8,11 @@ use std::sync::Arc;
 /// Minimum number of splats per covered pixel of a level that is drawn because of its distance alone. Pictures of such levels of fox and
 /// fern are closer to the picture at full size, shrunk, than those of all splats, which are widened to a pixel each, or at most 0.6 dB
 /// farther from it. `levels.js` has the same value.
-const DENSE: f32 = 2.0;
+const MIN_SPLATS_PER_PIXEL: f32 = 2.0;
 /// Number of positions used to estimate what a camera sees.
-const SAMPLE: usize = 4096;
+const MAX_SAMPLES: usize = 4096;
 /// Share of the splats in view that is left out on either side when the covered area is measured.
-const OUTSIDE: f32 = 0.05;
+const MARGIN_SHARE: f32 = 0.05;
 
 /// Levels of detail, each with about half the splats of the one before, the first with half of the scene's.
 #[derive(Clone, Default)]
@@ -35,23 +35,23 @@ impl Levels {
         self.levels.get(number.checked_sub(1)?)
     }
 
-    /// The number of the level to draw for a moving camera: the coarsest with at least [`DENSE`] splats per pixel, or a coarser one if only
-    /// the fraction `affordable` of the scene's splats can be drawn in time.
+    /// The number of the level to draw for a moving camera: the coarsest with at least [`MIN_SPLATS_PER_PIXEL`] splats per pixel, or a
+    /// coarser one if only the fraction `affordable` of the scene's splats can be drawn in time.
     pub fn choose(&self, camera: &Camera, affordable: f32) -> usize {
         let Some(coarsest) = self.levels.last() else { return 0 };
         let by_time = (-affordable.log2()).ceil() as usize;
-        let seen = splats_a_pixel(coarsest, camera);
-        let dense = |level: &&Splats| seen * level.len() as f32 / coarsest.len().max(1) as f32 >= DENSE;
+        let seen = splats_per_pixel(coarsest, camera);
+        let dense = |level: &&Splats| seen * level.len() as f32 / coarsest.len().max(1) as f32 >= MIN_SPLATS_PER_PIXEL;
         let by_distance = self.levels.iter().take_while(dense).count();
         by_time.max(by_distance).min(self.levels.len())
     }
 }
 
 /// Splats in view per pixel of the box that contains most of them.
-fn splats_a_pixel(splats: &Splats, camera: &Camera) -> f32 {
+fn splats_per_pixel(splats: &Splats, camera: &Camera) -> f32 {
     let k = &camera.intrinsics;
     let size = Vec2::new(k.width as f32, k.height as f32);
-    let step = splats.len().div_ceil(SAMPLE).max(1);
+    let step = splats.len().div_ceil(MAX_SAMPLES).max(1);
     let in_view: Vec<Vec2> = (0..splats.len())
         .step_by(step)
         .filter_map(|i| camera.project(splats.mean(i).into()))
@@ -67,7 +67,7 @@ fn splats_a_pixel(splats: &Splats, camera: &Camera) -> f32 {
                 .copied()
                 .unwrap_or(0.0)
         };
-        (at(1.0 - OUTSIDE) - at(OUTSIDE)).max(1.0)
+        (at(1.0 - MARGIN_SHARE) - at(MARGIN_SHARE)).max(1.0)
     };
     (in_view.len() * step) as f32 / (extent(|p| p.x) * extent(|p| p.y))
 }

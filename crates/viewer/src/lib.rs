@@ -13,7 +13,7 @@
 //! | file | idea |
 //! |---|---|
 //! | `subject.rs`, `views.rs`, `live.rs` | what is shown: a scene, its photographs, a training |
-//! | `desk.rs`, `pace.rs`, `draw.rs` | which pictures pages request, when they are drawn, at which size |
+//! | `scheduler.rs`, `pace.rs`, `draw.rs` | which pictures pages request, when they are drawn, at which size |
 //! | `levels.rs` | which level of detail a moving camera gets |
 //! | `paint.rs`, `palette.rs` | a camera's picture: colours, depth, normals, counts, ellipses, errors |
 //! | `editing/` | selections and edits of a finished scene, which all pages share |
@@ -28,7 +28,6 @@
 
 mod client;
 mod compact;
-mod desk;
 mod draw;
 mod editing;
 mod error;
@@ -44,6 +43,7 @@ mod pace;
 mod page;
 mod paint;
 mod palette;
+mod scheduler;
 mod serve;
 mod share;
 mod subject;

@@ -15,13 +15,13 @@ use tokio::sync::{Notify, Semaphore};
 /// The default port.
 pub const DEFAULT_PORT: u16 = 7979;
 /// Number of ports that are tried after a taken one.
-const MORE_PORTS: u16 = 50;
+const MAX_PORT_TRIES: u16 = 50;
 /// Maximum number of connections; further ones are closed immediately. A page needs up to seven.
-const CONNECTIONS: usize = 96;
+const MAX_CONNECTIONS: usize = 96;
 /// Time in which a client must send the head of a request.
-const PATIENCE: Duration = Duration::from_secs(10);
+const HEADER_TIMEOUT: Duration = Duration::from_secs(10);
 /// Maximum bytes of a request's head.
-const HEAD: usize = 16 << 10;
+const MAX_HEADER_BYTES: usize = 16 << 10;
 
 /// Where to listen.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -58,7 +58,7 @@ impl Listen {
         let last = if self.port == 0 {
             0
         } else {
-            self.port.saturating_add(MORE_PORTS)
+            self.port.saturating_add(MAX_PORT_TRIES)
         };
         for port in self.port..=last {
             let tried: Vec<SocketAddr> = addresses
@@ -98,7 +98,7 @@ pub(crate) async fn accept(
 ) -> io::Result<()> {
     listener.set_nonblocking(true)?;
     let listener = tokio::net::TcpListener::from_std(listener)?;
-    let free = Arc::new(Semaphore::new(CONNECTIONS));
+    let free = Arc::new(Semaphore::new(MAX_CONNECTIONS));
     loop {
         let accepted = tokio::select! {
             accepted = listener.accept() => accepted,
@@ -110,9 +110,9 @@ pub(crate) async fn accept(
             continue;
         };
         let Ok(permit) = free.clone().try_acquire_owned() else {
-            notices.once(
+            notices.report_once(
                 "connections",
-                format_args!("more than {CONNECTIONS} connections: further ones are closed"),
+                format_args!("more than {MAX_CONNECTIONS} connections: further ones are closed"),
             );
             continue;
         };
@@ -121,8 +121,8 @@ pub(crate) async fn accept(
         tokio::spawn(async move {
             let mut http = http1::Builder::new();
             http.timer(TokioTimer::new())
-                .header_read_timeout(PATIENCE)
-                .max_buf_size(HEAD);
+                .header_read_timeout(HEADER_TIMEOUT)
+                .max_buf_size(MAX_HEADER_BYTES);
             // A broken connection is the client's problem.
             let _ = http
                 .serve_connection(TokioIo::new(stream), service)
@@ -171,7 +171,7 @@ mod tests {
         .bind()
         .expect("another port");
         let other = second.local_addr().expect("bound").port();
-        assert!(other > port && other <= port.saturating_add(MORE_PORTS));
+        assert!(other > port && other <= port.saturating_add(MAX_PORT_TRIES));
     }
 
     #[test]

@@ -13,11 +13,11 @@ use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
 /// Maximum number of points of a curve: more would not be visible. When it is exceeded, every second one is dropped.
-const CURVE_POINTS: usize = 1024;
+const MAX_CURVE_POINTS: usize = 1024;
 /// Number of points of the plan.
 const PLAN_POINTS: usize = 200;
 /// Time over which the speed is averaged, seconds.
-const SPEED_OVER: f64 = 3.0;
+const SPEED_WINDOW_SECONDS: f64 = 3.0;
 
 /// The phase of the training.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -44,7 +44,7 @@ struct History {
     total_steps: u64,
     curve: Vec<CurvePoint>,
     /// Steps between points of the curve.
-    apart: u64,
+    point_interval: u64,
     /// How many times points have been dropped.
     thinned: u64,
     stages: Vec<(u64, String)>,
@@ -58,7 +58,7 @@ struct History {
 
 /// The part of the history that a page already has.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Known {
+pub(crate) struct ReportCursor {
     points: usize,
     thinned: u64,
 }
@@ -109,7 +109,7 @@ impl Live {
                 newest: None,
                 total_steps: trainer.total_steps(),
                 curve: Vec::new(),
-                apart: 1,
+                point_interval: 1,
                 thinned: 0,
                 stages: Vec::new(),
                 mse: None,
@@ -145,11 +145,11 @@ impl Live {
     }
 
     /// A page was opened: a copy is taken now unless one is scheduled.
-    pub fn look(&self) {
+    pub fn page_opened(&self) {
         lock(&self.due).get_or_insert_with(Instant::now);
     }
 
-    pub fn act(&self, action: Action) {
+    pub fn apply(&self, action: Action) {
         let mut control = lock(&self.control);
         match action {
             Action::Pause => control.paused = true,
@@ -165,18 +165,18 @@ impl Live {
         &self.plan
     }
 
-    /// The state of the training, with the points of the curves after `known`, which is updated.
-    pub fn report(&self, known: &mut Known) -> Value {
+    /// The state of the training, with the points of the curves after `cursor`, which is updated.
+    pub fn report(&self, cursor: &mut ReportCursor) -> Value {
         let history = lock(&self.history);
-        if known.thinned != history.thinned {
-            *known = Known {
+        if cursor.thinned != history.thinned {
+            *cursor = ReportCursor {
                 points: 0,
                 thinned: history.thinned,
             };
         }
-        let from = known.points.min(history.curve.len());
+        let from = cursor.points.min(history.curve.len());
         // The last point may still change.
-        known.points = history.curve.len().saturating_sub(1);
+        cursor.points = history.curve.len().saturating_sub(1);
         let newest = history.newest.as_ref();
         json!({
             "tell": "train",
@@ -205,7 +205,7 @@ impl Live {
         let now = Instant::now();
         if let Some(last) = history.last_step_at {
             let seconds = now.duration_since(last).as_secs_f64().max(1e-6);
-            let share = 1.0 - (-seconds / SPEED_OVER).exp();
+            let share = 1.0 - (-seconds / SPEED_WINDOW_SECONDS).exp();
             let fresh = if history.steps_per_second == 0.0 { 1.0 } else { share };
             history.steps_per_second += fresh * (1.0 / seconds - history.steps_per_second);
         }
@@ -214,7 +214,10 @@ impl Live {
         history.total_steps = trainer.total_steps();
         history.mse = Some(history.mse.map_or(report.mse, |mean| 0.95 * mean + 0.05 * report.mse));
         history.newest = Some(*report);
-        let after = history.curve.last().map_or(0, |last| last.step + history.apart);
+        let after = history
+            .curve
+            .last()
+            .map_or(0, |last| last.step + history.point_interval);
         if report.step >= after {
             history.push(CurvePoint {
                 step: report.step,
@@ -226,7 +229,7 @@ impl Live {
         }
     }
 
-    fn see(&self, event: &Event, trainer: &Trainer) {
+    fn record_event(&self, event: &Event, trainer: &Trainer) {
         match event {
             Event::Step(report) => self.step(report, trainer),
             Event::Evaluated {
@@ -254,14 +257,14 @@ impl Live {
             Event::Started { total_steps, .. } => lock(&self.history).total_steps = *total_steps,
             Event::Densified { .. } | Event::Decided { .. } => {}
         }
-        self.take_copies();
+        self.request_due_copy();
         if matches!(event, Event::Finished { .. } | Event::Paused { .. }) {
-            self.changed();
+            self.notify_change();
         }
     }
 
     /// Requests a copy of the scene if one is due, and announces that the scene may have changed.
-    fn take_copies(&self) {
+    fn request_due_copy(&self) {
         let mut due = lock(&self.due);
         if due.is_some_and(|due| due <= Instant::now()) {
             // The next time is set when this copy has been drawn; until then there is one copy a minute.
@@ -269,10 +272,10 @@ impl Live {
             self.snapshots.request();
         }
         drop(due);
-        self.changed();
+        self.notify_change();
     }
 
-    fn changed(&self) {
+    fn notify_change(&self) {
         if let Some(on_change) = self.on_change.get() {
             on_change();
         }
@@ -296,13 +299,13 @@ impl History {
             Some(last) if last.step == point.step => last.psnr = point.psnr.or(last.psnr),
             _ => self.curve.push(point),
         }
-        if self.curve.len() > CURVE_POINTS {
+        if self.curve.len() > MAX_CURVE_POINTS {
             let mut index = 0;
             self.curve.retain(|point| {
                 index += 1;
                 point.psnr.is_some() || index % 2 == 1
             });
-            self.apart *= 2;
+            self.point_interval *= 2;
             self.thinned += 1;
         }
     }
@@ -325,17 +328,17 @@ enum Role {
 
 /// The observers that connect a training with its viewer, to be given to [`Run::train`].
 pub struct Watcher {
-    controls: Observing,
-    saves: Observing,
+    controls: RoleObserver,
+    saves: RoleObserver,
 }
 
-struct Observing(Arc<Live>, Role);
+struct RoleObserver(Arc<Live>, Role);
 
 impl Watcher {
     pub(crate) fn new(live: Arc<Live>) -> Self {
         Self {
-            controls: Observing(live.clone(), Role::Controls),
-            saves: Observing(live, Role::Saves),
+            controls: RoleObserver(live.clone(), Role::Controls),
+            saves: RoleObserver(live, Role::Saves),
         }
     }
 
@@ -345,10 +348,10 @@ impl Watcher {
     }
 }
 
-impl Observer for Observing {
+impl Observer for RoleObserver {
     fn on_event(&mut self, event: &Event, trainer: &Trainer) -> Signal {
         if matches!(self.1, Role::Controls) {
-            self.0.see(event, trainer);
+            self.0.record_event(event, trainer);
         }
         self.0.signal(self.1)
     }
@@ -359,7 +362,7 @@ impl Observer for Observing {
 
     fn while_paused(&mut self, _trainer: &Trainer) -> Signal {
         if matches!(self.1, Role::Controls) {
-            self.0.take_copies();
+            self.0.request_due_copy();
             if std::mem::take(&mut lock(&self.0.control).one_step) {
                 return Signal::Continue;
             }

@@ -5,31 +5,31 @@ use std::fmt::Display;
 use std::sync::{Mutex, PoisonError};
 
 /// Receives one line at a time.
-pub type Tell = Box<dyn Fn(&str) + Send + Sync>;
+pub type LineSink = Box<dyn Fn(&str) + Send + Sync>;
 
 pub(crate) struct Notices {
-    tell: Tell,
-    told: Mutex<HashSet<&'static str>>,
+    sink: LineSink,
+    reported: Mutex<HashSet<&'static str>>,
 }
 
 impl Notices {
-    pub fn new(tell: Tell) -> Self {
+    pub fn new(sink: LineSink) -> Self {
         Self {
-            tell,
-            told: Mutex::default(),
+            sink,
+            reported: Mutex::default(),
         }
     }
 
     /// Reports `line` if nothing of this `kind` has been reported.
-    pub fn once(&self, kind: &'static str, line: impl Display) {
-        let mut told = self.told.lock().unwrap_or_else(PoisonError::into_inner);
-        if told.insert(kind) {
-            (self.tell)(&line.to_string());
+    pub fn report_once(&self, kind: &'static str, line: impl Display) {
+        let mut reported = self.reported.lock().unwrap_or_else(PoisonError::into_inner);
+        if reported.insert(kind) {
+            (self.sink)(&line.to_string());
         }
     }
 
     /// Reports `line`.
-    pub fn always(&self, line: impl Display) {
-        (self.tell)(&line.to_string());
+    pub fn report(&self, line: impl Display) {
+        (self.sink)(&line.to_string());
     }
 }

@@ -3,23 +3,23 @@
 use crate::message::{MAX_PIXELS, Shot};
 
 /// Seconds of drawing and encoding a picture of a moving camera: 25 pictures a second.
-const MOVING: f32 = 0.04;
+const MOVING_SECONDS: f32 = 0.04;
 /// The same while a training shares the processor: smaller pictures, so that the rate stays the same beside its steps.
-const MOVING_IN_TRAINING: f32 = 0.015;
+const TRAINING_MOVING_SECONDS: f32 = 0.015;
 /// Seconds within which a camera at rest gets a better picture.
-const RESTING: f32 = 0.2;
+const RESTING_SECONDS: f32 = 0.2;
 /// Minimum share of the window's pixels.
-const LEAST: f32 = 0.03;
+const MIN_PIXEL_SHARE: f32 = 0.03;
 /// All splats are drawn while moving if half of them, at all pixels, take less than this share of a moving picture's time: all take less
 /// than twice the time.
-const SPARE: f32 = 0.5;
+const MAX_HALF_COST_SHARE: f32 = 0.5;
 
 /// How much of a picture is drawn.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Detail {
     /// Share of the window's pixels.
     pub pixels: f32,
-    /// Share of the splats, most important first: 1, or at most [`Detail::MOST_SPLATS`].
+    /// Share of the splats, most important first: 1, or at most [`Detail::MAX_PARTIAL_SPLATS`].
     pub splats: f32,
     /// Whether the camera moves.
     pub moving: bool,
@@ -31,7 +31,7 @@ pub(crate) struct Detail {
 
 impl Detail {
     /// The largest share of splats below all of them.
-    pub const MOST_SPLATS: f32 = 0.5;
+    pub const MAX_PARTIAL_SPLATS: f32 = 0.5;
 }
 
 /// The measured cost of pictures.
@@ -56,7 +56,7 @@ impl Default for Pace {
 }
 
 /// The largest share of the window's pixels.
-fn most(shot: &Shot) -> f32 {
+fn max_pixel_share(shot: &Shot) -> f32 {
     let k = &shot.camera.intrinsics;
     (MAX_PIXELS / (k.width as f32 * k.height as f32)).min(1.0)
 }
@@ -65,13 +65,17 @@ impl Pace {
     /// How the next picture of a moving camera is drawn.
     pub fn moving(&self, shot: &Shot, training: bool) -> Detail {
         Detail {
-            seconds: if training { MOVING_IN_TRAINING } else { MOVING },
-            pixels: self.share.min(most(shot)),
+            seconds: if training {
+                TRAINING_MOVING_SECONDS
+            } else {
+                MOVING_SECONDS
+            },
+            pixels: self.share.min(max_pixel_share(shot)),
             // Coarser pixels hide the missing splats.
             splats: if self.all {
                 1.0
             } else {
-                Detail::MOST_SPLATS * self.share.sqrt()
+                Detail::MAX_PARTIAL_SPLATS * self.share.sqrt()
             },
             moving: true,
             sharp: false,
@@ -80,31 +84,31 @@ impl Pace {
 
     /// How the next picture of a camera at rest is drawn. `last`: the pixels' share of its last picture, if it had all splats.
     pub fn resting(&self, shot: &Shot, last: Option<f32>) -> Detail {
-        let most = most(shot);
+        let max_pixel_share = max_pixel_share(shot);
         let k = &shot.camera.intrinsics;
-        let affordable = RESTING / (self.per_pixel * k.width as f32 * k.height as f32);
+        let affordable = RESTING_SECONDS / (self.per_pixel * k.width as f32 * k.height as f32);
         // Four times as many pixels cost at most four times as much.
         let next = affordable.max(last.map_or(0.0, |last| 4.0 * last)).max(self.share);
         Detail {
-            seconds: RESTING,
-            pixels: next.min(most),
+            seconds: RESTING_SECONDS,
+            pixels: next.min(max_pixel_share),
             splats: 1.0,
             moving: false,
-            sharp: next >= most,
+            sharp: next >= max_pixel_share,
         }
     }
 
     /// Learns from a picture of `pixels` that took `seconds`.
-    pub fn learn(&mut self, detail: &Detail, pixels: f32, seconds: f32) {
+    pub fn update(&mut self, detail: &Detail, pixels: f32, seconds: f32) {
         self.per_pixel = seconds / pixels.max(1.0);
         if detail.moving {
             // Part of the cost is fixed, so it grows more slowly than the share: finding the share takes several pictures.
             let factor = (detail.seconds / seconds.max(1e-4)).clamp(0.4, 1.4);
-            self.share = (self.share * factor).clamp(LEAST, 1.0);
+            self.share = (self.share * factor).clamp(MIN_PIXEL_SHARE, 1.0);
             self.all = if self.all {
                 seconds <= detail.seconds
             } else {
-                self.share == 1.0 && seconds < SPARE * detail.seconds
+                self.share == 1.0 && seconds < MAX_HALF_COST_SHARE * detail.seconds
             };
         }
     }
@@ -139,11 +143,11 @@ mod tests {
         let cost = |detail: &Detail| 0.05 * detail.splats + 1e-7 * 1e6 * detail.pixels;
         for _ in 0..20 {
             let detail = pace.moving(&shot, false);
-            assert!(!detail.sharp && detail.splats <= Detail::MOST_SPLATS);
-            pace.learn(&detail, 1e6 * detail.pixels, cost(&detail));
+            assert!(!detail.sharp && detail.splats <= Detail::MAX_PARTIAL_SPLATS);
+            pace.update(&detail, 1e6 * detail.pixels, cost(&detail));
         }
         let found = cost(&pace.moving(&shot, false));
-        assert!((found - MOVING).abs() < 0.004, "{found}");
+        assert!((found - MOVING_SECONDS).abs() < 0.004, "{found}");
     }
 
     #[test]
@@ -155,7 +159,7 @@ mod tests {
             for _ in 0..40 {
                 let detail = pace.moving(&shot, false);
                 drawn.push(detail.splats == 1.0);
-                pace.learn(&detail, 1e6 * detail.pixels, seconds(&detail));
+                pace.update(&detail, 1e6 * detail.pixels, seconds(&detail));
             }
             assert!(drawn[20..].iter().all(|drawn| *drawn == all), "{cost}: {drawn:?}");
         }
@@ -165,11 +169,11 @@ mod tests {
     fn a_camera_at_rest_gets_every_pixel_at_once_or_in_steps() {
         let (mut pace, shot) = (Pace::default(), shot(1000, 1000));
         let full = pace.resting(&shot, None);
-        pace.learn(&full, 1e6, 0.1);
+        pace.update(&full, 1e6, 0.1);
         let detail = pace.resting(&shot, None);
         assert_eq!((detail.pixels, detail.splats, detail.sharp), (1.0, 1.0, true));
         // A field of 10 microseconds a pixel.
-        pace.learn(&pace.moving(&shot, false), 1e5, 1.0);
+        pace.update(&pace.moving(&shot, false), 1e5, 1.0);
         let mut detail = pace.resting(&shot, None);
         assert!(detail.pixels < 0.2 && !detail.sharp);
         for _ in 0..4 {

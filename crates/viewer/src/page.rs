@@ -9,7 +9,7 @@ const TEXT: &str = "text/plain; charset=utf-8";
 const JSON: &str = "application/json";
 
 /// The name under which the page fetches [`kernels`].
-pub(crate) const KERNELS: &str = "shaders/kernels.json";
+pub(crate) const KERNELS_FILE: &str = "shaders/kernels.json";
 
 macro_rules! files {
     ($($kind:ident $name:literal,)*) => {
@@ -57,6 +57,7 @@ const FILES: &[(&str, &str, &str)] = files![
     SCRIPT "js/path.js",
     SCRIPT "js/share.js",
     SCRIPT "js/sidebar.js",
+    SCRIPT "js/similarity.js",
     SCRIPT "js/stage.js",
     SCRIPT "js/state.js",
     SCRIPT "js/timeline.js",
@@ -77,7 +78,7 @@ const FILES: &[(&str, &str, &str)] = files![
 
 /// Content type and text of a file.
 pub(crate) fn file(name: &str) -> Option<(&'static str, &'static str)> {
-    if name == KERNELS {
+    if name == KERNELS_FILE {
         return Some((JSON, kernels()));
     }
     FILES

@@ -1,6 +1,6 @@
 //! The picture of a camera: colours, depth, alpha, normals, counts, ellipses, or the error against a photograph.
 
-use crate::editing::placed;
+use crate::editing::moved_camera;
 use crate::importance::by_importance;
 use crate::message::{Mode, Picked, PickedSplat, Shot};
 use crate::pace::Detail;
@@ -19,13 +19,13 @@ use std::borrow::Cow;
 use std::sync::Arc;
 
 /// Rows of a field that are drawn between two checks whether the picture is still wanted.
-const ROWS: u32 = 32;
+const STRIP_ROWS: u32 = 32;
 /// Opacity of a splat outside the clipping box, before the sigmoid: far below 1/255.
-const HIDDEN: f32 = -30.0;
+const HIDDEN_LOGIT: f32 = -30.0;
 /// Error that is drawn in the last colour of the map.
-const WORST: f32 = 0.25;
+const MAX_ERROR: f32 = 0.25;
 /// Coverage below which a pixel has no depth.
-const COVERED: f32 = 0.5;
+const MIN_DEPTH_ALPHA: f32 = 0.5;
 
 /// A picture, 8 bits, `[H, W, 3]`.
 pub(crate) struct Picture {
@@ -50,14 +50,14 @@ struct Planes {
 pub(crate) struct Painter {
     renderer: Renderer,
     /// The most important splats of a version, most important first.
-    most: Option<Most>,
+    important: Option<ImportantSplats>,
     /// Splats that differ from the scene's: clipped, selected, or coloured by their normals.
     altered: Option<(Alteration, Splats)>,
     /// The last photograph that was read, by its view.
     photo: Option<(usize, Arc<Photo>)>,
 }
 
-struct Most {
+struct ImportantSplats {
     /// Of the splats.
     version: u64,
     /// Their indices in the scene.
@@ -78,8 +78,8 @@ struct Alteration {
 /// The part of the scene that is altered.
 #[derive(Clone, Copy, PartialEq)]
 enum Part {
-    /// [`Painter::most`].
-    Most,
+    /// [`Painter::important`].
+    Important,
     /// A level of detail; 0 is the scene itself.
     Level(usize),
 }
@@ -95,17 +95,17 @@ impl Painter {
         if detail.splats == 1.0
             || has_levels(edition, shot)
             || self
-                .most
+                .important
                 .as_ref()
-                .is_some_and(|most| most.version == edition.splats_version)
+                .is_some_and(|important| important.version == edition.splats_version)
         {
             return;
         }
-        self.most = edition.scene().model.splats().map(|splats| {
-            let count = (splats.len() as f32 * Detail::MOST_SPLATS).ceil() as usize;
+        self.important = edition.scene().model.splats().map(|splats| {
+            let count = (splats.len() as f32 * Detail::MAX_PARTIAL_SPLATS).ceil() as usize;
             let mut order = by_importance(splats);
             order.truncate(count);
-            Most {
+            ImportantSplats {
                 version: edition.splats_version,
                 splats: splats.gather(&order),
                 order,
@@ -134,30 +134,37 @@ impl Painter {
         };
         let (rgb, range) = match (&scene.model, shot.mode) {
             (Model::Splats { splats, residual }, mode) => {
-                let most = self.most.take();
+                let important = self.important.take();
                 let number = match detail.moving && has_levels(edition, shot) {
                     true => edition.levels.choose(&camera, detail.splats),
                     false => 0,
                 };
                 let level = edition.levels.get(number);
-                let few = most.as_ref().filter(|_| detail.splats < 1.0 && level.is_none());
+                let few = important.as_ref().filter(|_| detail.splats < 1.0 && level.is_none());
                 let options = RenderOptions {
                     sh_degree: if mode == Mode::Normals { 0 } else { options.sh_degree },
                     first: few.map_or(usize::MAX, |_| (detail.splats * splats.len() as f32) as usize),
                     ..options
                 };
                 let part = match few {
-                    Some(_) => Part::Most,
+                    Some(_) => Part::Important,
                     None => Part::Level(number),
                 };
-                let splats = few.map_or(level.unwrap_or(splats), |most| &most.splats);
-                let altered = self.altered(edition, splats, part, few.map(|most| &most.order[..]), shot, &camera);
+                let splats = few.map_or(level.unwrap_or(splats), |important| &important.splats);
+                let altered = self.altered(
+                    edition,
+                    splats,
+                    part,
+                    few.map(|important| &important.order[..]),
+                    shot,
+                    &camera,
+                );
                 let splats = altered.as_ref().map_or(splats, |(_, splats)| splats);
                 let residual = residual.as_deref().filter(|_| mode != Mode::Normals);
                 let light = light_of(edition, shot.light).filter(|_| mode != Mode::Normals);
                 render_splats(splats, residual, light, &mut self.renderer, &camera, &options);
                 let drawn = self.splats_picture(mode, &options, (width, height), shot, light, view);
-                (self.altered, self.most) = (altered, most);
+                (self.altered, self.important) = (altered, important);
                 drawn?
             }
             (Model::Field(field), mode) => {
@@ -204,7 +211,7 @@ impl Painter {
             (alteration, altered)
         });
         if alteration.normals {
-            face(&mut altered, camera.pose.position);
+            orient_normals(&mut altered, camera.pose.position);
         }
         Some((alteration, altered))
     }
@@ -230,7 +237,7 @@ impl Painter {
         if mode == Mode::Count {
             return Some(counts_picture(&self.renderer.counts()));
         }
-        let color = developed(light, self.renderer.color());
+        let color = apply_exposure(light, self.renderer.color());
         if mode == Mode::Color || mode == Mode::Normals {
             return Some((to_rgb(&color), None));
         }
@@ -289,7 +296,7 @@ impl Painter {
     pub fn score(&mut self, edition: &Edition, index: usize, view: &SeenView) -> Option<f64> {
         let scene = edition.scene();
         let photo = view.photo.as_ref()?.load().ok()?;
-        let camera = placed(&view.camera, &edition.placement);
+        let camera = moved_camera(&view.camera, &edition.placement);
         let k = &camera.intrinsics;
         let truth = photo.resized(k.width, k.height);
         let (truth, mask) = (truth.over(scene.options.background), truth.mask);
@@ -298,7 +305,7 @@ impl Painter {
                 let light = light_of(edition, view.trained.then_some(index));
                 let residual = residual.as_deref();
                 render_splats(splats, residual, light, &mut self.renderer, &camera, &scene.options);
-                to_rgb(&developed(light, self.renderer.color()))
+                to_rgb(&apply_exposure(light, self.renderer.color()))
             }
             Model::Field(_) => {
                 let frame = scene.model.render(&mut self.renderer, &camera, &scene.options);
@@ -389,7 +396,7 @@ fn light_of(edition: &Edition, view: Option<usize>) -> Option<Light<'_>> {
 }
 
 /// `color` `[3, H, W]` in the exposure of `light`.
-fn developed<'c>(light: Option<Light>, color: &'c [f32]) -> Cow<'c, [f32]> {
+fn apply_exposure<'c>(light: Option<Light>, color: &'c [f32]) -> Cow<'c, [f32]> {
     light.map_or(Cow::Borrowed(color), |light| light.developed(color))
 }
 
@@ -449,7 +456,7 @@ fn alter(splats: &Splats, alteration: &Alteration) -> Splats {
         for i in 0..n {
             let mean = splats.mean(i);
             if (0..3).any(|c| mean[c] < low[c] || mean[c] > high[c]) {
-                altered.opacity_logits.set(0, i, HIDDEN);
+                altered.opacity_logits.set(0, i, HIDDEN_LOGIT);
             }
         }
     }
@@ -473,7 +480,7 @@ fn tint(splats: &mut Splats, is_selected: impl Fn(usize) -> bool + Sync) {
 }
 
 /// Turns normals, kept as harmonics of degree 0, towards the camera at `center`.
-fn face(splats: &mut Splats, center: Vec3) {
+fn orient_normals(splats: &mut Splats, center: Vec3) {
     for i in 0..splats.len() {
         let outward = Vec3::from(splats.mean(i)) - center;
         let normal = Vec3::from_array(std::array::from_fn(|c| splats.sh.get(c, i)));
@@ -501,13 +508,13 @@ fn field_planes(
         alpha: Vec::with_capacity(pixels),
         depth: Vec::with_capacity(pixels),
     };
-    for top in (0..k.height).step_by(ROWS as usize) {
+    for top in (0..k.height).step_by(STRIP_ROWS as usize) {
         if !wanted() {
             return None;
         }
         let strip = Camera {
             intrinsics: Intrinsics {
-                height: ROWS.min(k.height - top),
+                height: STRIP_ROWS.min(k.height - top),
                 cy: k.cy - top as f32,
                 ..k
             },
@@ -544,7 +551,7 @@ fn to_8_bits(value: f32) -> u8 {
     (value.clamp(0.0, 1.0) * 255.0).round() as u8
 }
 
-fn mapped(color: [f32; 3]) -> [u8; 3] {
+fn to_8_bit_color(color: [f32; 3]) -> [u8; 3] {
     color.map(to_8_bits)
 }
 
@@ -565,25 +572,30 @@ fn to_rgb(planes: &[f32]) -> Vec<u8> {
 }
 
 /// The next value below (or above, if `up`) of a grid of ten per decade, so that a scale does not flicker.
-fn snapped(value: f32, up: bool) -> f32 {
+fn rounded_to_grid(value: f32, up: bool) -> f32 {
     let at = 10.0 * value.log10();
     10f32.powf(if up { at.ceil() } else { at.floor() } / 10.0)
 }
 
 /// Depth in logarithmic colours, near is light, between the 1st and the 99th percentile.
 fn depth_picture(depth: &[f32], alpha: &[f32]) -> (Vec<u8>, Option<[f32; 2]>) {
-    let covered = || depth.iter().zip(alpha).filter(|(d, a)| **a > COVERED && **d > 0.0);
+    let covered = || {
+        depth
+            .iter()
+            .zip(alpha)
+            .filter(|(d, a)| **a > MIN_DEPTH_ALPHA && **d > 0.0)
+    };
     let mut sample: Vec<f32> = covered().step_by(7).map(|(d, _)| *d).collect();
     sample.sort_unstable_by(f32::total_cmp);
     let at = |share: f32| sample.get((sample.len() as f32 * share) as usize).copied();
     let (Some(near), Some(far)) = (at(0.01), at(0.99)) else {
         return (vec![0; 3 * depth.len()], None);
     };
-    let (near, far) = (snapped(near, false), snapped(far, true));
+    let (near, far) = (rounded_to_grid(near, false), rounded_to_grid(far, true));
     let scale = 1.0 / (far / near).ln().max(1e-6);
     let color = |(d, a): (&f32, &f32)| {
-        if *a > COVERED && *d > 0.0 {
-            mapped(palette::even(1.0 - (d / near).ln() * scale))
+        if *a > MIN_DEPTH_ALPHA && *d > 0.0 {
+            to_8_bit_color(palette::sequential(1.0 - (d / near).ln() * scale))
         } else {
             [0; 3]
         }
@@ -597,7 +609,7 @@ fn counts_picture(counts: &[f32]) -> (Vec<u8>, Option<[f32; 2]>) {
     let most = counts.iter().copied().fold(1.0, f32::max);
     let most = 2f32.powf(most.log2().ceil());
     let scale = 1.0 / (1.0 + most).ln();
-    let color = |count: &f32| mapped(palette::even((1.0 + count).ln() * scale));
+    let color = |count: &f32| to_8_bit_color(palette::sequential((1.0 + count).ln() * scale));
     (counts.iter().flat_map(color).collect(), Some([0.0, most]))
 }
 
@@ -606,7 +618,7 @@ fn error_picture(color: &[f32], truth: &[u8]) -> (Vec<u8>, Option<[f32; 2]>) {
     let pixels = color.len() / 3;
     let error = |i: usize| {
         let channel = |c: usize| (color[c * pixels + i].clamp(0.0, 1.0) - f32::from(truth[3 * i + c]) / 255.0).abs();
-        mapped(palette::heat((0..3).map(channel).sum::<f32>() / 3.0 / WORST))
+        to_8_bit_color(palette::heat((0..3).map(channel).sum::<f32>() / 3.0 / MAX_ERROR))
     };
-    ((0..pixels).flat_map(error).collect(), Some([0.0, WORST]))
+    ((0..pixels).flat_map(error).collect(), Some([0.0, MAX_ERROR]))
 }

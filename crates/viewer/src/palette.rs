@@ -2,7 +2,7 @@
 
 /// Anchors of the map for depth and counts, evenly spaced: dark violet through teal to yellow, close to matplotlib's viridis
 /// (van der Walt and Smith, CC0), whose lightness grows evenly.
-const EVEN: [[f32; 3]; 9] = [
+const SEQUENTIAL: [[f32; 3]; 9] = [
     [0.267, 0.005, 0.329],
     [0.279, 0.175, 0.483],
     [0.230, 0.322, 0.546],
@@ -27,7 +27,7 @@ const HEAT: [[f32; 3]; 5] = [
 pub const SELECTED: [f32; 3] = [1.0, 0.72, 0.0];
 pub const SELECTED_SHARE: f32 = 0.6;
 
-fn between(anchors: &[[f32; 3]], value: f32) -> [f32; 3] {
+fn interpolate(anchors: &[[f32; 3]], value: f32) -> [f32; 3] {
     // NaN becomes 0.
     let at = value.clamp(0.0, 1.0).max(0.0) * (anchors.len() - 1) as f32;
     let low = (at as usize).min(anchors.len() - 2);
@@ -36,13 +36,13 @@ fn between(anchors: &[[f32; 3]], value: f32) -> [f32; 3] {
 }
 
 /// For depth and counts.
-pub fn even(value: f32) -> [f32; 3] {
-    between(&EVEN, value)
+pub fn sequential(value: f32) -> [f32; 3] {
+    interpolate(&SEQUENTIAL, value)
 }
 
 /// For errors.
 pub fn heat(value: f32) -> [f32; 3] {
-    between(&HEAT, value)
+    interpolate(&HEAT, value)
 }
 
 #[cfg(test)]
@@ -51,7 +51,7 @@ mod tests {
 
     #[test]
     fn maps_begin_and_end_at_their_anchors_and_grow_lighter() {
-        for (map, anchors) in [(even as fn(f32) -> [f32; 3], &EVEN[..]), (heat, &HEAT[..])] {
+        for (map, anchors) in [(sequential as fn(f32) -> [f32; 3], &SEQUENTIAL[..]), (heat, &HEAT[..])] {
             assert_eq!((map(0.0), map(1.0)), (anchors[0], anchors[anchors.len() - 1]));
             assert_eq!((map(-3.0), map(7.0), map(f32::NAN)), (map(0.0), map(1.0), map(0.0)));
             let light = |v: f32| {

@@ -1,13 +1,13 @@
 //! The routes: the page's files, photographs, splats, and the socket. No path of a request names a file.
 
 use crate::compact::compact_in_order;
-use crate::desk::Desk;
 use crate::draw::encode;
 use crate::editing::stem_of;
-use crate::guard::{Entry, Guard, TOKEN, UPLOADS};
+use crate::guard::{Entry, Guard, TOKEN_NAME, UPLOAD_PATH};
 use crate::importance::by_importance;
 use crate::message::MAX_REQUEST;
 use crate::notices::Notices;
+use crate::scheduler::Scheduler;
 use crate::subject::{Edition, Subject};
 use crate::{client, page};
 use axum::Router;
@@ -32,19 +32,19 @@ use tokio::sync::Semaphore;
 use tokio::time::timeout;
 
 /// Longer side of a thumbnail, pixels.
-const THUMBNAIL: u32 = 192;
+const THUMBNAIL_SIDE: u32 = 192;
 /// Maximum bytes of thumbnails that are kept.
-const THUMBNAILS: usize = 16 << 20;
+const MAX_THUMBNAIL_BYTES: usize = 16 << 20;
 /// Maximum bytes of a scene that a page sends.
-const MOST_UPLOADED: usize = 1 << 30;
+const MAX_UPLOAD_BYTES: usize = 1 << 30;
 /// Maximum time to send it.
-const UPLOADING: Duration = Duration::from_secs(600);
+const UPLOAD_TIMEOUT: Duration = Duration::from_secs(600);
 /// JPEG quality of photographs.
-const QUALITY: u8 = 90;
+const PHOTO_QUALITY: u8 = 90;
 /// Maximum number of splats of a scene whose levels of detail are sent too: larger scenes alone fill the textures of many browsers.
-const WITH_LEVELS: usize = 4_000_000;
+const MAX_SPLATS_WITH_LEVELS: usize = 4_000_000;
 /// The page loads only what this server serves, and no other page may frame it.
-const POLICY: &str = "default-src 'self'; img-src 'self' blob: data:; style-src 'self' 'unsafe-inline'; frame-ancestors 'none'; \
+const SECURITY_POLICY: &str = "default-src 'self'; img-src 'self' blob: data:; style-src 'self' 'unsafe-inline'; frame-ancestors 'none'; \
                       base-uri 'none'; form-action 'none'";
 
 /// What all requests share.
@@ -52,7 +52,7 @@ pub(crate) struct Shared {
     /// Identifies the scene and its photographs: what a browser has cached for the same address may belong to another scene.
     pub id: String,
     pub subject: Subject,
-    pub desk: Desk,
+    pub scheduler: Scheduler,
     pub guard: Guard,
     pub notices: Arc<Notices>,
     /// The compact splats of a version.
@@ -87,7 +87,7 @@ impl Shared {
         Self {
             id: identity(&subject),
             subject,
-            desk: Desk::default(),
+            scheduler: Scheduler::default(),
             guard,
             notices,
             splats: Mutex::default(),
@@ -125,14 +125,14 @@ pub(crate) fn router(shared: Arc<Shared>) -> Router {
         .route("/splats", get(splats))
         .route("/selection/{version}", get(selection))
         .route("/download/{format}", get(download))
-        .route(&format!("{UPLOADS}{{name}}"), post(upload))
+        .route(&format!("{UPLOAD_PATH}{{name}}"), post(upload))
         .route(
             "/view/{view}/photo",
             get(|app: App, Path(view): Path<usize>| photo(app, view, None)),
         )
         .route(
             "/view/{view}/thumbnail",
-            get(|app: App, Path(view): Path<usize>| photo(app, view, Some(THUMBNAIL))),
+            get(|app: App, Path(view): Path<usize>| photo(app, view, Some(THUMBNAIL_SIDE))),
         )
         .route("/socket", get(socket))
         .layer(from_fn_with_state(shared.clone(), guarded))
@@ -146,12 +146,14 @@ async fn guarded(State(shared): App, request: Request, next: Next) -> Response {
         Ok(_) => next.run(request).await,
         Err(refusal) => {
             let reason = refusal.reason();
-            shared.notices.once(reason, format_args!("refused a request: {reason}"));
+            shared
+                .notices
+                .report_once(reason, format_args!("refused a request: {reason}"));
             (StatusCode::FORBIDDEN, reason).into_response()
         }
     };
     let headers = response.headers_mut();
-    headers.insert(CONTENT_SECURITY_POLICY, HeaderValue::from_static(POLICY));
+    headers.insert(CONTENT_SECURITY_POLICY, HeaderValue::from_static(SECURITY_POLICY));
     headers.insert(X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
     headers.insert(REFERRER_POLICY, HeaderValue::from_static("no-referrer"));
     headers
@@ -159,7 +161,7 @@ async fn guarded(State(shared): App, request: Request, next: Next) -> Response {
         .or_insert(HeaderValue::from_static("no-store"));
     if entry == Ok(Entry::ByAddress)
         && let Some(token) = &shared.guard.token
-        && let Ok(cookie) = HeaderValue::from_str(&format!("{TOKEN}={token}; HttpOnly; SameSite=Strict; Path=/"))
+        && let Ok(cookie) = HeaderValue::from_str(&format!("{TOKEN_NAME}={token}; HttpOnly; SameSite=Strict; Path=/"))
     {
         headers.insert(SET_COOKIE, cookie);
     }
@@ -194,7 +196,7 @@ async fn splats(State(shared): App) -> Response {
         }
         let scene = edition.scene();
         let order = worker.order(&edition)?;
-        let levels = match order.len() <= WITH_LEVELS {
+        let levels = match order.len() <= MAX_SPLATS_WITH_LEVELS {
             true => edition.levels.all(),
             false => &[],
         };
@@ -290,7 +292,7 @@ async fn upload(State(shared): App, Path(name): Path<String>, body: Body) -> Res
     let Ok(_permit) = shared.uploading.acquire().await else {
         return StatusCode::SERVICE_UNAVAILABLE.into_response();
     };
-    let bytes = match timeout(UPLOADING, to_bytes(body, MOST_UPLOADED)).await {
+    let bytes = match timeout(UPLOAD_TIMEOUT, to_bytes(body, MAX_UPLOAD_BYTES)).await {
         Ok(Ok(bytes)) => bytes,
         Ok(Err(_)) => {
             let why = "the scene is truncated, or larger than 1 GiB: merge it with irradia edit";
@@ -339,22 +341,27 @@ async fn photo(State(shared): App, view: usize, side: Option<u32>) -> Response {
     let encoded = tokio::task::spawn_blocking(move || {
         let photo = source.load()?;
         let photo = match side {
-            Some(side) => fitted(&photo, side),
+            Some(side) => fit_photo(&photo, side),
             None => photo,
         };
-        Ok::<_, irradia_scene::LoadError>(encode(&photo.over(background), photo.width, photo.height, QUALITY))
+        Ok::<_, irradia_scene::LoadError>(encode(
+            &photo.over(background),
+            photo.width,
+            photo.height,
+            PHOTO_QUALITY,
+        ))
     });
     match encoded.await {
         Ok(Ok(jpeg)) => {
             let bytes = Bytes::from(jpeg);
             let mut kept = thumbnails();
-            if side.is_some() && kept.values().map(Bytes::len).sum::<usize>() < THUMBNAILS {
+            if side.is_some() && kept.values().map(Bytes::len).sum::<usize>() < MAX_THUMBNAIL_BYTES {
                 kept.insert(view, bytes.clone());
             }
             answer(bytes)
         }
         Ok(Err(error)) => {
-            shared.notices.once("photograph", &error);
+            shared.notices.report_once("photograph", &error);
             (StatusCode::NOT_FOUND, error.to_string()).into_response()
         }
         Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
@@ -362,7 +369,7 @@ async fn photo(State(shared): App, view: usize, side: Option<u32>) -> Response {
 }
 
 /// `photo` with at most `side` pixels on its longer side.
-fn fitted(photo: &Photo, side: u32) -> Photo {
+fn fit_photo(photo: &Photo, side: u32) -> Photo {
     let factor = (side as f32 / photo.width.max(photo.height) as f32).min(1.0);
     let scaled = |side: u32| ((side as f32 * factor).round() as u32).max(1);
     photo.resized(scaled(photo.width), scaled(photo.height))

@@ -5,7 +5,7 @@
 
 use crate::ViewerError;
 use crate::compact::compact;
-use crate::page::{KERNELS, file};
+use crate::page::{KERNELS_FILE, file};
 use irradia_runs::formats::{gzip, write_atomic};
 use irradia_runs::scene::base64;
 use irradia_runs::{Film, Scene};
@@ -20,14 +20,14 @@ use std::path::Path;
 const SCENE_FILE: &str = "scene.irs.gz";
 const POSTER_FILE: &str = "poster.png";
 /// Size of the start picture, which is drawn before the size of the page is known.
-const POSTER: (u32, u32) = (1280, 720);
+const POSTER_SIZE: (u32, u32) = (1280, 720);
 /// Cameras per second of a flight that are stored in the page.
 const KEYS_PER_SECOND: f32 = 5.0;
 /// Maximum number of attempts to meet a limit of bytes by merging splats.
-const TRIES: u32 = 5;
+const MAX_TRIES: u32 = 5;
 
 /// Modules of the page that draw, in `js/local/`.
-const DRAWING: [&str; 8] = [
+const DRAWING_MODULES: [&str; 8] = [
     "device", "frame", "levels", "renderer", "sort", "stream", "webgl", "webgpu",
 ];
 /// Their shaders, beside the program's own.
@@ -83,11 +83,11 @@ pub fn share(scene: &Scene, output: &Path, options: &ShareOptions) -> Result<Sha
         true => around + packed.len() as u64,
         false => around + (packed.len() as u64).div_ceil(3) * 4,
     };
-    let Fitted {
+    let PackedScene {
         packed,
         splats: counts,
         degree,
-    } = fitting(splats, scene.options.sh_degree, options.max_bytes, &cost)?;
+    } = pack_within(splats, scene.options.sh_degree, options.max_bytes, &cost)?;
     let shared = |bytes| Shared {
         bytes,
         splats: counts,
@@ -103,7 +103,7 @@ pub fn share(scene: &Scene, output: &Path, options: &ShareOptions) -> Result<Sha
         source,
     })?;
     let poster = output.join(POSTER_FILE);
-    let camera = scene.orbit(1, Some(POSTER))[0];
+    let camera = scene.orbit(1, Some(POSTER_SIZE))[0];
     irradia_runs::write_image(&poster, &scene.render(&camera).color)?;
     write_atomic(&output.join(SCENE_FILE), |out| out.write_all(&packed))?;
     let text = page(scene, options, None);
@@ -113,7 +113,7 @@ pub fn share(scene: &Scene, output: &Path, options: &ShareOptions) -> Result<Sha
 }
 
 /// A scene's compact form.
-struct Fitted {
+struct PackedScene {
     /// Gzipped.
     packed: Vec<u8>,
     /// Splats in it, and of the whole scene.
@@ -122,21 +122,21 @@ struct Fitted {
     degree: u32,
 }
 
-/// The compact form that costs at most `most`: harmonics are left out first, then splats are merged.
-fn fitting(
+/// The compact form that costs at most `max_bytes`: harmonics are left out first, then splats are merged.
+fn pack_within(
     splats: &Splats,
     degree: u32,
-    most: Option<u64>,
+    max_bytes: Option<u64>,
     cost: &dyn Fn(&[u8]) -> u64,
-) -> Result<Fitted, ViewerError> {
-    let most = most.unwrap_or(u64::MAX);
+) -> Result<PackedScene, ViewerError> {
+    let max_bytes = max_bytes.unwrap_or(u64::MAX);
     let highest = degree.min(splats.sh_degree());
     let mut last = (Vec::new(), 0);
     for degree in (0..=highest).rev() {
         let bytes = compact(splats, degree, usize::MAX);
-        last = (gzip(&bytes), seen(&bytes));
-        if cost(&last.0) <= most {
-            return Ok(Fitted {
+        last = (gzip(&bytes), splat_count(&bytes));
+        if cost(&last.0) <= max_bytes {
+            return Ok(PackedScene {
                 packed: last.0,
                 splats: [last.1; 2],
                 degree,
@@ -146,8 +146,8 @@ fn fitting(
     let all = last.1;
     let around = cost(&[]);
     let mut fewer = Cow::Borrowed(splats);
-    for _ in 0..TRIES {
-        let share = most.saturating_sub(around) as f64 / (cost(&last.0) - around) as f64;
+    for _ in 0..MAX_TRIES {
+        let share = max_bytes.saturating_sub(around) as f64 / (cost(&last.0) - around) as f64;
         // A little less than the share, since fewer splats compress a little worse.
         let count = (last.1 as f64 * share * 0.98) as usize;
         if count == 0 {
@@ -155,20 +155,23 @@ fn fitting(
         }
         fewer = Cow::Owned(merged(&fewer, count));
         let bytes = compact(&fewer, 0, usize::MAX);
-        last = (gzip(&bytes), seen(&bytes));
-        if cost(&last.0) <= most {
-            return Ok(Fitted {
+        last = (gzip(&bytes), splat_count(&bytes));
+        if cost(&last.0) <= max_bytes {
+            return Ok(PackedScene {
                 packed: last.0,
                 splats: [last.1, all],
                 degree: 0,
             });
         }
     }
-    Err(ViewerError::TooSmall { bytes: most, around })
+    Err(ViewerError::TooSmall {
+        bytes: max_bytes,
+        around,
+    })
 }
 
 /// The number of splats in a compact form.
-fn seen(bytes: &[u8]) -> usize {
+fn splat_count(bytes: &[u8]) -> usize {
     u32::from_le_bytes([bytes[4], bytes[5], bytes[6], bytes[7]]) as usize
 }
 
@@ -180,7 +183,7 @@ fn page(scene: &Scene, options: &ShareOptions, packed: Option<&[u8]>) -> String 
         ["../math", "./assets"]
             .into_iter()
             .map(str::to_owned)
-            .chain(DRAWING.map(|name| format!("./{name}")))
+            .chain(DRAWING_MODULES.map(|name| format!("./{name}")))
             .fold(text.to_owned(), |text, place| {
                 let name = place.rsplit('/').next().unwrap_or_default();
                 text.replace(&format!("\"{place}.js\""), &format!("\"irradia/{name}.js\""))
@@ -191,7 +194,7 @@ fn page(scene: &Scene, options: &ShareOptions, packed: Option<&[u8]>) -> String 
         "irradia/math.js": address(&module("js/math.js")),
         "irradia/assets.js": address(include_str!("../share/assets.js")),
     });
-    for name in DRAWING {
+    for name in DRAWING_MODULES {
         imports[format!("irradia/{name}.js")] = address(&module(&format!("js/local/{name}.js"))).into();
     }
     let imports = json!({ "imports": imports });
@@ -201,7 +204,7 @@ fn page(scene: &Scene, options: &ShareOptions, packed: Option<&[u8]>) -> String 
     };
     let shaders: serde_json::Map<_, _> = SHADERS
         .into_iter()
-        .chain([KERNELS])
+        .chain([KERNELS_FILE])
         .map(|path| {
             let name = path.trim_start_matches("shaders/");
             (name.to_owned(), file(path).expect("a shader").1.into())
@@ -241,7 +244,7 @@ fn page(scene: &Scene, options: &ShareOptions, packed: Option<&[u8]>) -> String 
 /// What the page needs besides the splats: the camera of the first frame of `irradia render --orbit`, and the point it turns about.
 fn view(scene: &Scene, options: &ShareOptions, in_file: bool) -> serde_json::Value {
     let camera = scene.orbit(1, None)[0];
-    let outlook = scene.outlook();
+    let orbit_geometry = scene.orbit_geometry();
     let k = camera.intrinsics;
     let rotation = camera.pose.rotation;
     let fov = 2.0 * (0.5 * k.height as f32 / k.fy).atan();
@@ -252,9 +255,9 @@ fn view(scene: &Scene, options: &ShareOptions, in_file: bool) -> serde_json::Val
             "fov": fov,
         },
         "aspect": k.width as f32 / k.height as f32,
-        "pivot": outlook.center.to_array(),
-        "up": outlook.up.to_array(),
-        "radius": outlook.radius,
+        "pivot": orbit_geometry.center.to_array(),
+        "up": orbit_geometry.up.to_array(),
+        "radius": orbit_geometry.radius,
         "background": scene.options.background,
         "antialias": scene.options.antialias,
         "file": in_file.then_some(SCENE_FILE),

@@ -1,14 +1,15 @@
 //! What is shown: a finished scene, or the state of a training.
 
 use crate::ViewerError;
-use crate::editing::Editing;
+use crate::editing::{Editing, to_world};
 use crate::levels::Levels;
 use crate::live::{Live, Watcher};
 use crate::views::Views;
 use irradia_edit::Transform;
 use irradia_runs::formats::Lenses;
 use irradia_runs::{
-    Reading, Run, RunFolder, Scene, Snapshot, TrainInput, is_moved, read_levels, read_lights, scene_of,
+    Reading, Run, RunFolder, Scene, Snapshot, TrainInput, is_moved, moved_from_run, read_levels, read_lights,
+    scene_path,
 };
 use irradia_scene::Dataset;
 use irradia_splat::Splats;
@@ -29,45 +30,59 @@ pub(crate) struct Edition {
     pub selected: Option<Arc<Vec<bool>>>,
     /// How edits have moved the scene, and with it everything in it, such as the cameras of views.
     pub placement: Transform,
+    /// From the coordinates of the photographs to the world of the scene before the edits.
+    opened: Transform,
     /// Levels of detail of these splats, if there are any: an edit drops them.
     pub levels: Levels,
     /// The light of each view, if it is known.
     pub lights: Option<Arc<Lights>>,
-    held: Held,
+    source: SceneSource,
 }
 
 #[derive(Clone)]
-enum Held {
+enum SceneSource {
     Scene(Arc<Scene>),
     Snapshot(Arc<Snapshot>),
 }
 
 impl Edition {
-    fn of_scene(scene: Scene, levels: Levels, lights: Option<Lights>) -> Self {
+    /// A finished scene, which was `moved` away from its photographs.
+    fn of_scene(scene: Scene, moved: &Transform, levels: Levels, lights: Option<Lights>) -> Self {
         Self {
             version: 1,
             splats_version: 1,
             selected: None,
             placement: Transform::IDENTITY,
+            opened: moved.then(&to_world(&scene.world_from_dataset)),
             levels,
             lights: lights.map(Arc::new),
-            held: Held::Scene(Arc::new(scene)),
+            source: SceneSource::Scene(Arc::new(scene)),
         }
     }
 
     /// The scene.
     pub fn scene(&self) -> &Scene {
-        match &self.held {
-            Held::Scene(scene) => scene,
-            Held::Snapshot(snapshot) => &snapshot.scene,
+        match &self.source {
+            SceneSource::Scene(scene) => scene,
+            SceneSource::Snapshot(snapshot) => &snapshot.scene,
+        }
+    }
+
+    /// From the coordinates of the photographs, in which camera paths are saved, to the world. If a scene without cameras is moved and
+    /// saved, nothing tells how: its paths are in its own coordinates.
+    pub fn world_from_photographs(&self) -> Transform {
+        let scene = self.scene();
+        match &scene.cameras {
+            Some(_) => self.opened.then(&self.placement),
+            None => to_world(&scene.world_from_dataset),
         }
     }
 
     /// Number of training steps, if this is a state of a training.
     pub fn step(&self) -> Option<u64> {
-        match &self.held {
-            Held::Scene(_) => None,
-            Held::Snapshot(snapshot) => Some(snapshot.step),
+        match &self.source {
+            SceneSource::Scene(_) => None,
+            SceneSource::Snapshot(snapshot) => Some(snapshot.step),
         }
     }
 }
@@ -96,7 +111,7 @@ impl Subject {
     /// When there is nothing to show, or it cannot be read.
     pub fn open(path: &Path, data: Option<&Path>, reading: &Reading) -> Result<Self, ViewerError> {
         let folder = RunFolder::containing(path);
-        let file = scene_of(path);
+        let file = scene_path(path);
         if file.is_dir() {
             if folder.is_some() {
                 return Err(ViewerError::Unfinished { path: path.to_owned() });
@@ -117,7 +132,7 @@ impl Subject {
                 .and_then(|mut input| {
                     // The viewer draws pinhole pictures, which are compared with undistorted photographs.
                     input.reading.lenses = Lenses::Undistorted;
-                    reading.over(input.reading).read(&input.data)
+                    reading.with_fallback(input.reading).read(&input.data)
                 })
                 .map_err(|error| warnings.push(format!("no photographs: {error}")))
                 .ok(),
@@ -143,6 +158,7 @@ impl Subject {
             warnings.push(format!("no levels of detail: {error}"));
             Vec::new()
         });
+        let moved = moved_from_run(&file);
         let editing = match &scene.model {
             Model::Splats { splats, residual: None } => Ok(Editing::new(file, splats.len())),
             Model::Splats { .. } => {
@@ -157,7 +173,7 @@ impl Subject {
             live: None,
             folder,
             recipe,
-            edition: Mutex::new(Some(Edition::of_scene(scene, Levels::new(levels), lights))),
+            edition: Mutex::new(Some(Edition::of_scene(scene, &moved, Levels::new(levels), lights))),
             warnings,
         })
     }
@@ -189,7 +205,12 @@ impl Subject {
             live: None,
             folder: None,
             recipe: None,
-            edition: Mutex::new(Some(Edition::of_scene(scene, Levels::default(), None))),
+            edition: Mutex::new(Some(Edition::of_scene(
+                scene,
+                &Transform::IDENTITY,
+                Levels::default(),
+                None,
+            ))),
             warnings,
         }
     }
@@ -222,7 +243,7 @@ impl Subject {
         if let Some(scene) = scene {
             edition.splats_version = edition.version;
             edition.levels = Levels::default();
-            edition.held = Held::Scene(Arc::new(scene));
+            edition.source = SceneSource::Scene(Arc::new(scene));
         }
     }
 
@@ -238,9 +259,10 @@ impl Subject {
                     splats_version: version,
                     selected: None,
                     placement: Transform::IDENTITY,
+                    opened: to_world(&snapshot.scene.world_from_dataset),
                     levels: Levels::default(),
                     lights: snapshot.lights.clone(),
-                    held: Held::Snapshot(snapshot),
+                    source: SceneSource::Snapshot(snapshot),
                 });
             }
         }

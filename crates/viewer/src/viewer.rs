@@ -1,10 +1,10 @@
 //! The running server.
 
 use crate::draw::draw;
-use crate::editing::work;
-use crate::guard::{Guard, TOKEN, random_token};
+use crate::editing::run_editing;
+use crate::guard::{Guard, TOKEN_NAME, random_token};
 use crate::listen::{Listen, accept, open_browser, reachable};
-use crate::notices::{Notices, Tell};
+use crate::notices::{LineSink, Notices};
 use crate::serve::{Shared, router};
 use crate::{Subject, ViewerError};
 use serde_json::json;
@@ -15,9 +15,9 @@ use std::time::{Duration, Instant};
 use tokio::sync::Notify;
 
 /// Interval at which a waiting program checks whether it should stop: the load is not measurable.
-const LOOK: Duration = Duration::from_millis(100);
+const POLL_INTERVAL: Duration = Duration::from_millis(100);
 /// Time without pages after which the viewer counts as closed: a page that is reloaded comes back sooner.
-const GONE: Duration = Duration::from_secs(4);
+const CLOSED_TIMEOUT: Duration = Duration::from_secs(4);
 
 /// A server with its thread, and the thread that draws; both end when it is dropped.
 pub struct Viewer {
@@ -38,7 +38,7 @@ impl Viewer {
         tell: Box<dyn Fn(&str) + Send + Sync>,
     ) -> Result<Self, ViewerError> {
         let refused = |error: io::Error| ViewerError::Start(error.to_string());
-        let notices = Arc::new(Notices::new(tell as Tell));
+        let notices = Arc::new(Notices::new(tell as LineSink));
         let listener = listen.bind()?;
         let bound = listener.local_addr().map_err(refused)?;
         let token = if bound.ip().is_loopback() {
@@ -48,10 +48,10 @@ impl Viewer {
         };
         let query = token
             .as_ref()
-            .map_or(String::new(), |token| format!("?{TOKEN}={token}"));
+            .map_or(String::new(), |token| format!("?{TOKEN_NAME}={token}"));
         let address = format!("http://{}/{query}", reachable(bound));
         if listen.port != 0 && bound.port() != listen.port {
-            notices.always(format_args!("port {} is taken: using {}", listen.port, bound.port()));
+            notices.report(format_args!("port {} is taken: using {}", listen.port, bound.port()));
         }
         let guard = Guard {
             host: listen.host.clone(),
@@ -59,10 +59,10 @@ impl Viewer {
         };
         let shared = Arc::new(Shared::new(subject, guard, notices.clone()));
         if let Some(live) = &shared.subject.live {
-            let desk = Arc::downgrade(&shared);
+            let weak = Arc::downgrade(&shared);
             let wake = move || {
-                if let Some(shared) = desk.upgrade() {
-                    shared.desk.wake();
+                if let Some(shared) = weak.upgrade() {
+                    shared.scheduler.wake();
                 }
             };
             // A subject is shown by one viewer.
@@ -84,7 +84,7 @@ impl Viewer {
             let (router, closing) = (router(shared.clone()), closing.clone());
             move || {
                 if let Err(error) = runtime.block_on(accept(listener, router, notices.clone(), closing)) {
-                    notices.always(format_args!("the viewer has stopped: {error}"));
+                    notices.report(format_args!("the viewer has stopped: {error}"));
                 }
                 // Photographs that are being decoded must not delay the end.
                 runtime.shutdown_background();
@@ -92,19 +92,19 @@ impl Viewer {
         };
         let drawing = {
             let shared = shared.clone();
-            move || pool.install(|| draw(&shared.subject, &shared.desk))
+            move || pool.install(|| draw(&shared.subject, &shared.scheduler))
         };
         let editing = {
             // In the program's global pool: only finished scenes are edited.
             let shared = shared.clone();
             move || {
                 let Ok(editing) = &shared.subject.editing else { return };
-                let tell = |seat, line: &str| {
-                    let told = json!({ "tell": "problem", "text": line });
-                    shared.desk.tell(seat, told.to_string());
+                let tell = |client, line: &str| {
+                    let message = json!({ "tell": "problem", "text": line });
+                    shared.scheduler.send_text(client, message.to_string());
                 };
-                if let Some(line) = work(editing, &shared.subject, &tell, &|| shared.desk.wake()) {
-                    shared.notices.always(format_args!("{line}"));
+                if let Some(line) = run_editing(editing, &shared.subject, &tell, &|| shared.scheduler.wake()) {
+                    shared.notices.report(format_args!("{line}"));
                 }
             }
         };
@@ -128,7 +128,7 @@ impl Viewer {
             viewer
                 .shared
                 .notices
-                .always(format_args!("cannot start a browser: {error}"));
+                .report(format_args!("cannot start a browser: {error}"));
         }
         Ok(viewer)
     }
@@ -140,21 +140,21 @@ impl Viewer {
 
     /// Whether a page is open.
     pub fn is_watched(&self) -> bool {
-        self.shared.desk.len() > 0
+        self.shared.scheduler.len() > 0
     }
 
     /// Serves until `stop`.
     pub fn wait(&self, stop: &dyn Fn() -> bool) {
         while !stop() {
-            thread::sleep(LOOK);
+            thread::sleep(POLL_INTERVAL);
         }
     }
 
     /// Serves until `stop`, or until no page has been open for a few seconds.
     pub fn wait_while_watched(&self, stop: &dyn Fn() -> bool) {
         let mut seen = Instant::now();
-        while !stop() && seen.elapsed() < GONE {
-            thread::sleep(LOOK);
+        while !stop() && seen.elapsed() < CLOSED_TIMEOUT {
+            thread::sleep(POLL_INTERVAL);
             if self.is_watched() {
                 seen = Instant::now();
             }
@@ -164,7 +164,7 @@ impl Viewer {
 
 impl Drop for Viewer {
     fn drop(&mut self) {
-        self.shared.desk.close();
+        self.shared.scheduler.close();
         if let Ok(editing) = &self.shared.subject.editing {
             editing.close();
         }

@@ -1,28 +1,32 @@
-//! Development only: `cargo xtask deps`, `files` and `scripts` check the project's rules and print one line per violation.
+//! Development only: `cargo xtask deps`, `features`, `files` and `scripts` check the project's rules and print one line per violation.
 #![forbid(unsafe_code)]
 
 mod deps;
 mod files;
 
 use anyhow::{Context, Result, bail, ensure};
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::process::{Command, ExitCode};
 
 const USAGE: &str = "\
 usage: cargo xtask CHECK
-  deps    imports between crates
-  files   length and names of files; remainders of the step
-  scripts the shell scripts parse
-  all     all of them";
+  deps      imports between crates
+  features  tests and the program use external crates with the same features
+  files     length and names of files; remainders of the step
+  scripts   the shell scripts parse
+  all       all of them";
 
 fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let words: Vec<&str> = arguments.iter().map(String::as_str).collect();
     let violations = match words[..] {
         ["deps"] => check_deps(),
+        ["features"] => check_features(),
         ["files"] => check_files(),
         ["scripts"] => check_scripts(),
         ["all"] => check_deps().and_then(|mut violations| {
+            violations.extend(check_features()?);
             violations.extend(check_files()?);
             violations.extend(check_scripts()?);
             Ok(violations)
@@ -46,9 +50,7 @@ fn main() -> ExitCode {
 }
 
 fn check_deps() -> Result<Vec<String>> {
-    // Cargo sets its own path for the programs it runs.
-    let cargo = std::env::var("CARGO").unwrap_or_else(|_| "cargo".into());
-    let text = output(Command::new(cargo).args(["metadata", "--no-deps", "--format-version", "1"]))?;
+    let text = output(Command::new(cargo()).args(["metadata", "--no-deps", "--format-version", "1"]))?;
     let metadata = serde_json::from_str(&text).context("cargo metadata printed something that is not JSON")?;
     let violations = deps::violations(&metadata);
     ensure!(
@@ -58,6 +60,36 @@ fn check_deps() -> Result<Vec<String>> {
         "cargo metadata names no packages"
     );
     Ok(violations)
+}
+
+/// External crates of the program that have more features in tests. Cargo compiles such a crate twice, and all that depend on it: with two
+/// variants of `bitflags`, `cargo run` after `cargo test-all` took 340 s on two cores.
+fn check_features() -> Result<Vec<String>> {
+    let features = |edges: &str| -> Result<BTreeMap<String, String>> {
+        let tree = [
+            "tree",
+            "--workspace",
+            "--prefix",
+            "none",
+            "--format",
+            "{p}\t{f}",
+            "--edges",
+        ];
+        let lines = output(Command::new(cargo()).args(tree).arg(edges))?;
+        let packages = lines
+            .lines()
+            .filter_map(|line| line.trim_end_matches(" (*)").split_once('\t'));
+        Ok(packages
+            .map(|(package, features)| (package.to_owned(), features.to_owned()))
+            .collect())
+    };
+    let in_tests = features("normal,build,dev")?;
+    let differences = features("normal,build")?.into_iter().filter_map(|(package, program)| {
+        let tests = in_tests.get(&package)?;
+        (*tests != program)
+            .then(|| format!("{package}: features {program:?}, but {tests:?} in tests, so that it is compiled twice"))
+    });
+    Ok(differences.collect())
 }
 
 fn check_files() -> Result<Vec<String>> {
@@ -89,6 +121,11 @@ fn check_scripts() -> Result<Vec<String>> {
         }
     }
     Ok(violations)
+}
+
+/// Cargo sets its own path for the programs it runs.
+fn cargo() -> String {
+    std::env::var("CARGO").unwrap_or_else(|_| "cargo".into())
 }
 
 fn repository() -> Result<PathBuf> {

@@ -5,9 +5,9 @@ use std::sync::PoisonError;
 use std::sync::atomic::Ordering;
 
 /// Alignment of parts that are bound, words: 256 bytes, which every implementation accepts.
-pub const PART: usize = 64;
+pub const PART_ALIGN: usize = 64;
 /// Bytes read at a time, so that reading a large array takes little additional memory.
-const PIECE: usize = 32 << 20;
+const READ_CHUNK_BYTES: usize = 32 << 20;
 
 /// Memory on the device, in words of 32 bits, that grows and never shrinks.
 #[derive(Debug)]
@@ -31,7 +31,7 @@ impl Array {
     }
 
     /// `words` words of this array, starting at word `at`, as an array that shares the memory until this one grows. A part that is to be
-    /// bound must start at a multiple of [`PART`] words.
+    /// bound must start at a multiple of [`PART_ALIGN`] words.
     pub fn part(&self, at: usize, words: usize) -> Self {
         assert!(at + words <= self.words, "within {}", self.label);
         Self {
@@ -85,14 +85,14 @@ impl Array {
             return;
         }
         let mut staging = gpu.staging.lock().unwrap_or_else(PoisonError::into_inner);
-        let size = to.len().next_power_of_two().min(PIECE);
+        let size = to.len().next_power_of_two().min(READ_CHUNK_BYTES);
         let staging = match &mut *staging {
             Some(staging) if staging.words() * 4 >= size => staging,
             staging => staging.insert(Readback::new(gpu, size / 4)),
         };
-        for (i, piece) in to.chunks_mut(PIECE).enumerate() {
+        for (i, piece) in to.chunks_mut(READ_CHUNK_BYTES).enumerate() {
             let work = Work::new(gpu);
-            work.submit_reading(&self.part(at + i * PIECE / 4, piece.len() / 4), staging);
+            work.submit_reading(&self.part(at + i * READ_CHUNK_BYTES / 4, piece.len() / 4), staging);
             staging.take(gpu, piece);
         }
     }
@@ -166,7 +166,7 @@ fn buffer(gpu: &Gpu, label: &'static str, words: usize) -> wgpu::Buffer {
             name: gpu.info.name.clone(),
             label,
             needed: bytes(words).div_ceil(1_000_000),
-            held: gpu.held() / 1_000_000,
+            held: gpu.used_memory() / 1_000_000,
             fitting: None,
         });
     }

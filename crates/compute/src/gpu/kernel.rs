@@ -1,4 +1,4 @@
-use super::{Array, DRIVER, Gpu, Shader};
+use super::{Array, DRIVER_THREAD, Gpu, Shader};
 use std::borrow::Cow;
 use std::sync::{Mutex, PoisonError};
 
@@ -23,7 +23,7 @@ struct Bound {
 type Place = (wgpu::Buffer, u64, usize);
 
 /// Maximum number of sets of arrays that a kernel remembers.
-const REMEMBERED: usize = 16;
+const MAX_CACHED_BINDINGS: usize = 16;
 
 impl Kernel {
     /// Compiles `shader`. Drivers cache their results on disk.
@@ -37,7 +37,7 @@ impl Kernel {
             label: Some(shader.name),
             source: wgpu::ShaderSource::Wgsl(Cow::Owned(format!("{constants}{}", shader.source()))),
         };
-        let pipeline = DRIVER.install(|| compile(gpu, shader.name, descriptor));
+        let pipeline = DRIVER_THREAD.install(|| compile(gpu, shader.name, descriptor));
         Self {
             name: shader.name,
             layout: pipeline.get_bind_group_layout(0),
@@ -78,7 +78,7 @@ impl Kernel {
         let places = arrays
             .iter()
             .map(|array| (array.buffer().clone(), array.offset(0), array.len()));
-        if bound.groups.len() == REMEMBERED {
+        if bound.groups.len() == MAX_CACHED_BINDINGS {
             bound.groups.clear();
         }
         bound.groups.push((places.collect(), group.clone()));
@@ -108,7 +108,7 @@ fn compile(gpu: &Gpu, name: &str, descriptor: wgpu::ShaderModuleDescriptor) -> w
 }
 
 /// Maximum number of workgroups along one axis (WebGPU's limit).
-const LINE: u32 = 65_535;
+const MAX_GROUPS_PER_AXIS: u32 = 65_535;
 
 /// Kernels that run one after another, recorded to be submitted together.
 pub struct Work<'a> {
@@ -161,7 +161,7 @@ impl<'a> Work<'a> {
         self.names.push(kernel.name);
         pass.set_pipeline(&kernel.pipeline);
         pass.set_bind_group(0, &bindings, &[]);
-        let rows = (groups as u32).div_ceil(LINE);
+        let rows = (groups as u32).div_ceil(MAX_GROUPS_PER_AXIS);
         pass.dispatch_workgroups((groups as u32).div_ceil(rows), rows, 1);
     }
 
@@ -194,10 +194,10 @@ impl<'a> Work<'a> {
 
     /// Submits the work to the device, which starts at once.
     pub fn submit(self) {
-        self.hand_over();
+        self.submit_indexed();
     }
 
-    pub(super) fn hand_over(mut self) -> wgpu::SubmissionIndex {
+    pub(super) fn submit_indexed(mut self) -> wgpu::SubmissionIndex {
         self.pass = None;
         match self.gpu.profile.get() {
             Some(profile) => profile.submit(self.gpu, self.encoder, &self.names),

@@ -12,7 +12,7 @@ mod scan;
 mod sort;
 
 pub use crate::shaders::{ADAM, GRID, HARMONICS, Shader};
-pub use array::{Array, PART};
+pub use array::{Array, PART_ALIGN};
 pub use kernel::{Kernel, Work};
 pub use readback::Readback;
 pub use scan::Scan;
@@ -26,7 +26,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, LazyLock, Mutex, OnceLock, PoisonError};
 
 /// Default number of threads per workgroup: the largest that every implementation supports.
-pub const GROUP: u32 = 256;
+pub const WORKGROUP_SIZE: u32 = 256;
 
 /// What kind of processor an adapter is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -104,9 +104,9 @@ impl fmt::Debug for Gpu {
 }
 
 /// Bytes that a workgroup of the largest kernel shares.
-const SHARED: u32 = 22 << 10;
+const SHARED_BYTES: u32 = 22 << 10;
 /// Maximum number of storage arrays that a kernel binds.
-const BINDINGS: u32 = 12;
+const MAX_BINDINGS: u32 = 12;
 
 /// The drivers of this machine, loaded once.
 static INSTANCE: LazyLock<wgpu::Instance> = LazyLock::new(|| {
@@ -118,12 +118,12 @@ static INSTANCE: LazyLock<wgpu::Instance> = LazyLock::new(|| {
 
 /// Bytes of stack for a driver's compiler, whose recursion may be as deep as a shader is large; threads of servers and tests have only
 /// 2 MB.
-const STACK: usize = 32 << 20;
+const STACK_BYTES: usize = 32 << 20;
 
 /// The one thread that loads drivers, opens devices and compiles shaders; it lives as long as the process. NVIDIA's driver does not
 /// tolerate these calls on several threads at once (wgpu issue 10234), and may hang in a thread that ends after them (8365).
-static DRIVER: LazyLock<rayon::ThreadPool> = LazyLock::new(|| {
-    let builder = rayon::ThreadPoolBuilder::new().num_threads(1).stack_size(STACK);
+static DRIVER_THREAD: LazyLock<rayon::ThreadPool> = LazyLock::new(|| {
+    let builder = rayon::ThreadPoolBuilder::new().num_threads(1).stack_size(STACK_BYTES);
     let builder = builder.thread_name(|_| "gpu driver".to_owned());
     builder.build().expect("a thread can be started")
 });
@@ -164,16 +164,16 @@ fn describe(adapter: &wgpu::Adapter) -> AdapterInfo {
             true => [info.subgroup_min_size, info.subgroup_max_size],
             false => [0; 2],
         },
-        is_usable: limits.max_storage_buffers_per_shader_stage >= BINDINGS
-            && limits.max_compute_invocations_per_workgroup >= GROUP
-            && limits.max_compute_workgroup_storage_size >= SHARED,
+        is_usable: limits.max_storage_buffers_per_shader_stage >= MAX_BINDINGS
+            && limits.max_compute_invocations_per_workgroup >= WORKGROUP_SIZE
+            && limits.max_compute_workgroup_storage_size >= SHARED_BYTES,
     }
 }
 
 impl Gpu {
     /// The adapters of this machine, graphics cards first.
     pub fn adapters() -> Vec<AdapterInfo> {
-        DRIVER.install(|| list().into_iter().map(|(_, info)| info).collect())
+        DRIVER_THREAD.install(|| list().into_iter().map(|(_, info)| info).collect())
     }
 
     /// Opens an adapter.
@@ -181,7 +181,7 @@ impl Gpu {
     /// # Errors
     /// When there is none of the wanted kind, or its driver refuses.
     pub fn open(wanted: &Wanted) -> Result<Arc<Self>, DeviceError> {
-        DRIVER.install(|| Self::open_here(wanted))
+        DRIVER_THREAD.install(|| Self::open_here(wanted))
     }
 
     fn open_here(wanted: &Wanted) -> Result<Arc<Self>, DeviceError> {
@@ -265,7 +265,7 @@ impl Gpu {
     }
 
     /// Bytes of memory in use; 0 if the backend does not report it.
-    pub fn held(&self) -> u64 {
+    pub fn used_memory(&self) -> u64 {
         let report = self.device.generate_allocator_report();
         report.map_or(0, |report| report.total_allocated_bytes)
     }

@@ -3,7 +3,7 @@ use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
 
 /// Maximum number of kernels measured per submission.
-const KERNELS: u32 = 1024;
+const MAX_KERNELS: u32 = 1024;
 
 /// Seconds of each kernel by the device's own clock. While profiling, the host waits for every submission.
 #[derive(Debug)]
@@ -19,7 +19,7 @@ pub(super) struct Profile {
 
 impl Profile {
     pub fn new(device: &wgpu::Device, queue: &wgpu::Queue) -> Self {
-        let size = u64::from(2 * KERNELS) * 8;
+        let size = u64::from(2 * MAX_KERNELS) * 8;
         let buffer = |usage| {
             device.create_buffer(&wgpu::BufferDescriptor {
                 label: Some("times"),
@@ -32,7 +32,7 @@ impl Profile {
             queries: device.create_query_set(&wgpu::QuerySetDescriptor {
                 label: Some("times"),
                 ty: wgpu::QueryType::Timestamp,
-                count: 2 * KERNELS,
+                count: 2 * MAX_KERNELS,
             }),
             resolved: buffer(wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC),
             staging: buffer(wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST),
@@ -44,7 +44,7 @@ impl Profile {
     /// Where kernel `i` of a submission writes its times, if there is room.
     pub fn writes(&self, i: usize) -> Option<wgpu::ComputePassTimestampWrites<'_>> {
         let i = i as u32;
-        (i < KERNELS).then_some(wgpu::ComputePassTimestampWrites {
+        (i < MAX_KERNELS).then_some(wgpu::ComputePassTimestampWrites {
             query_set: &self.queries,
             beginning_of_pass_write_index: Some(2 * i),
             end_of_pass_write_index: Some(2 * i + 1),
@@ -58,7 +58,7 @@ impl Profile {
         mut encoder: wgpu::CommandEncoder,
         names: &[&'static str],
     ) -> wgpu::SubmissionIndex {
-        let names = &names[..names.len().min(KERNELS as usize)];
+        let names = &names[..names.len().min(MAX_KERNELS as usize)];
         let count = 2 * names.len() as u32;
         encoder.resolve_query_set(&self.queries, 0..count, &self.resolved, 0);
         encoder.copy_buffer_to_buffer(&self.resolved, 0, &self.staging, 0, 8 * u64::from(count));

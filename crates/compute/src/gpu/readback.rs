@@ -60,7 +60,7 @@ impl Work<'_> {
         }
         self.encoder()
             .copy_buffer_to_buffer(array.buffer(), array.offset(0), &to.staging, 0, bytes);
-        let submission = self.hand_over();
+        let submission = self.submit_indexed();
         to.staging.map_async(wgpu::MapMode::Read, ..bytes, |_| {});
         to.sent = Some((submission, bytes));
     }

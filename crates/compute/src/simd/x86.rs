@@ -240,8 +240,8 @@ macro_rules! float_lanes {
     };
 }
 
-const NEAREST: i32 = _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC;
-const DOWN: i32 = _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC;
+const ROUND_NEAREST: i32 = _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC;
+const ROUND_DOWN: i32 = _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC;
 
 float_lanes!(
     Avx512, F32x16, Mask16, 16,
@@ -249,7 +249,7 @@ float_lanes!(
     _mm512_fmadd_ps, _mm512_sqrt_ps, _mm512_min_ps, _mm512_max_ps,
     abs: |v| _mm512_abs_ps(v),
     neg: |v| _mm512_xor_ps(v, _mm512_set1_ps(-0.0)),
-    floor: |v| _mm512_roundscale_ps::<DOWN>(v),
+    floor: |v| _mm512_roundscale_ps::<ROUND_DOWN>(v),
     lt: |a, b| _mm512_cmp_ps_mask::<_CMP_LT_OQ>(a, b),
     le: |a, b| _mm512_cmp_ps_mask::<_CMP_LE_OQ>(a, b),
     select: |mask, a, b| _mm512_mask_blend_ps(mask, b, a),
@@ -269,7 +269,7 @@ float_lanes!(
     _mm256_fmadd_ps, _mm256_sqrt_ps, _mm256_min_ps, _mm256_max_ps,
     abs: |v| _mm256_andnot_ps(_mm256_set1_ps(-0.0), v),
     neg: |v| _mm256_xor_ps(v, _mm256_set1_ps(-0.0)),
-    floor: |v| _mm256_round_ps::<DOWN>(v),
+    floor: |v| _mm256_round_ps::<ROUND_DOWN>(v),
     lt: |a, b| _mm256_cmp_ps::<_CMP_LT_OQ>(a, b),
     le: |a, b| _mm256_cmp_ps::<_CMP_LE_OQ>(a, b),
     select: |mask, a, b| _mm256_blendv_ps(b, a, mask),
@@ -293,7 +293,7 @@ fn polynomial<V: Lanes>(f: V) -> V {
 fn exp2_16(v: F32x16) -> F32x16 {
     // SAFETY: the vector proves the instruction set.
     unsafe {
-        let n = _mm512_roundscale_ps::<NEAREST>(v.0);
+        let n = _mm512_roundscale_ps::<ROUND_NEAREST>(v.0);
         F32x16(_mm512_scalef_ps(polynomial(v - F32x16(n)).0, n))
     }
 }
@@ -302,7 +302,7 @@ fn exp2_16(v: F32x16) -> F32x16 {
 fn exp2_8(v: F32x8) -> F32x8 {
     // SAFETY: the vector proves the instruction set.
     unsafe {
-        let n = _mm256_round_ps::<NEAREST>(v.0);
+        let n = _mm256_round_ps::<ROUND_NEAREST>(v.0);
         let exponent = _mm256_slli_epi32::<23>(_mm256_add_epi32(_mm256_cvtps_epi32(n), _mm256_set1_epi32(127)));
         polynomial(v - F32x8(n)) * F32x8(_mm256_castsi256_ps(exponent))
     }

@@ -5,8 +5,8 @@ mod screen;
 mod space;
 
 use crate::floaters::floater_scores;
-use crate::sight::views_that_see;
 use crate::subject::subject;
+use crate::visibility::count_seeing_views;
 use crate::{Draft, EditError, Mode, SelectStep, Selection, Shape};
 
 /// The splats that `steps` select, none of them hidden or locked; without steps nothing is selected.
@@ -40,7 +40,7 @@ pub(crate) fn select_among(
     for step in steps {
         match &step.shape {
             Shape::Invert {} => selected.invert(),
-            Shape::Grow { by } => selected = space::grown(draft, &selected, *by),
+            Shape::Grow { by } => selected = space::grow(draft, &selected, *by),
             Shape::Connected { gap } => selected = space::connected(draft, &selected, *gap),
             shape => {
                 let inside = evaluate(draft, shape)?;
@@ -61,9 +61,9 @@ fn evaluate(draft: &Draft, shape: &Shape) -> Result<Selection, EditError> {
     Ok(match shape {
         Shape::All {} => Selection::all(draft.len()),
         Shape::Last {} => draft.last.clone(),
-        Shape::Box { .. } | Shape::Sphere { .. } | Shape::HalfSpace { .. } => region::inside(draft, shape),
+        Shape::Box { .. } | Shape::Sphere { .. } | Shape::HalfSpace { .. } => region::in_region(draft, shape),
         Shape::Color { .. } | Shape::Opacity { .. } | Shape::Size { .. } | Shape::Elongation { .. } => {
-            region::like(draft, shape)
+            region::in_property_range(draft, shape)
         }
         Shape::Polygon {
             camera,
@@ -82,7 +82,7 @@ fn evaluate(draft: &Draft, shape: &Shape) -> Result<Selection, EditError> {
                 return Err(EditError::NoCameras("views"));
             }
             let range = min.unwrap_or(0)..=max.unwrap_or(u32::MAX);
-            let views = views_that_see(draft);
+            let views = count_seeing_views(draft);
             Selection::of(draft.len(), |i| range.contains(&views[i]))
         }
         Shape::Floaters { score } => {
@@ -93,7 +93,7 @@ fn evaluate(draft: &Draft, shape: &Shape) -> Result<Selection, EditError> {
         Shape::Subject { margin } => {
             let (center, radius) = subject(draft).ok_or(EditError::NoCameras("subject"))?;
             let radius = radius * margin.unwrap_or(1.0);
-            region::inside(draft, &Shape::Sphere { center, radius })
+            region::in_region(draft, &Shape::Sphere { center, radius })
         }
         Shape::Invert {} | Shape::Grow { .. } | Shape::Connected { .. } => {
             unreachable!("they change the current selection")

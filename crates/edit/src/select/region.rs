@@ -7,7 +7,7 @@ use irradia_scene::sh;
 use irradia_splat::sigmoid;
 
 /// The splats whose centres are in a box, a ball or a half-space.
-pub(super) fn inside(draft: &Draft, shape: &Shape) -> Selection {
+pub(super) fn in_region(draft: &Draft, shape: &Shape) -> Selection {
     let n = draft.len();
     match *shape {
         Shape::Box { center, size, rotation } => {
@@ -27,7 +27,7 @@ pub(super) fn inside(draft: &Draft, shape: &Shape) -> Selection {
 }
 
 /// The splats with a colour, opacity, size or elongation in a range.
-pub(super) fn like(draft: &Draft, shape: &Shape) -> Selection {
+pub(super) fn in_property_range(draft: &Draft, shape: &Shape) -> Selection {
     let (n, cloud) = (draft.len(), &draft.cloud);
     let sorted = |i: usize| {
         let mut scales = cloud.log_scales[i].map(f64::from);

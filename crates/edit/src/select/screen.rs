@@ -1,6 +1,6 @@
 //! Selections drawn over a picture: polygons and brush strokes.
 
-use crate::sight::{Observer, SEEN};
+use crate::visibility::{MIN_VISIBLE_WEIGHT, Observer};
 use crate::{Draft, Selection, Viewpoint};
 use glam::DVec2;
 
@@ -59,7 +59,7 @@ pub(super) fn visible_only(draft: &Draft, camera: &Viewpoint, visible: bool, mut
     if visible {
         let camera = camera.camera(&draft.cloud.world_from_dataset);
         let weights = Observer::new(draft, &draft.visible()).weights(&camera);
-        selection.intersect(&Selection::of(draft.len(), |i| weights[i] >= SEEN));
+        selection.intersect(&Selection::of(draft.len(), |i| weights[i] >= MIN_VISIBLE_WEIGHT));
     }
     selection
 }

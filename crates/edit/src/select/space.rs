@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use std::collections::HashMap;
 
 /// Default gap, in units of the median distance to the nearest neighbour.
-const USUAL_GAP: f64 = 4.0;
+const DEFAULT_GAP_FACTOR: f64 = 4.0;
 
 /// A cell of a grid: the position of its lower corner in units of its side.
 type Cell = [i64; 3];
@@ -19,7 +19,7 @@ fn cell_of(position: DVec3, side: f64) -> Cell {
 }
 
 /// The cells that touch `cell`, itself included.
-fn around(cell: Cell) -> impl Iterator<Item = Cell> {
+fn neighbour_cells(cell: Cell) -> impl Iterator<Item = Cell> {
     (0..27).map(move |i| {
         let step = [i % 3, i / 3 % 3, i / 9];
         std::array::from_fn(|c| cell[c].saturating_add(step[c] - 1))
@@ -28,7 +28,7 @@ fn around(cell: Cell) -> impl Iterator<Item = Cell> {
 
 /// The selection, and all splats within `by` of it, dataset units. A search for the nearest selected splat takes as long for any distance,
 /// whereas cells of side `by` may each contain most of the selection.
-pub(super) fn grown(draft: &Draft, selected: &Selection, by: f64) -> Selection {
+pub(super) fn grow(draft: &Draft, selected: &Selection, by: f64) -> Selection {
     if selected.is_empty() {
         return selected.clone();
     }
@@ -43,13 +43,13 @@ pub(super) fn grown(draft: &Draft, selected: &Selection, by: f64) -> Selection {
 
 /// The connected component of each splat, and the number of splats in each component; touching cells of side `gap` are connected.
 struct Components {
-    of: Vec<u32>,
+    labels: Vec<u32>,
     sizes: Vec<usize>,
 }
 
 fn components(draft: &Draft, gap: Option<f64>) -> Components {
     let side = gap
-        .unwrap_or_else(|| USUAL_GAP * usual_distance(draft))
+        .unwrap_or_else(|| DEFAULT_GAP_FACTOR * median_neighbour_distance(draft))
         .max(f64::MIN_POSITIVE);
     let mut numbers: HashMap<Cell, u32> = HashMap::new();
     let mut cells: Vec<Cell> = Vec::new();
@@ -70,22 +70,22 @@ fn components(draft: &Draft, gap: Option<f64>) -> Components {
             continue;
         }
         component[start] = count;
-        let mut open = vec![start];
-        while let Some(cell) = open.pop() {
-            for next in around(cells[cell]).filter_map(|near| numbers.get(&near)) {
+        let mut pending_cells = vec![start];
+        while let Some(cell) = pending_cells.pop() {
+            for next in neighbour_cells(cells[cell]).filter_map(|near| numbers.get(&near)) {
                 let next = *next as usize;
                 if component[next] == u32::MAX {
                     component[next] = count;
-                    open.push(next);
+                    pending_cells.push(next);
                 }
             }
         }
         count += 1;
     }
-    let of: Vec<u32> = cell_of_splat.iter().map(|cell| component[*cell as usize]).collect();
+    let labels: Vec<u32> = cell_of_splat.iter().map(|cell| component[*cell as usize]).collect();
     let mut sizes = vec![0; count as usize];
-    of.iter().for_each(|component| sizes[*component as usize] += 1);
-    Components { of, sizes }
+    labels.iter().for_each(|component| sizes[*component as usize] += 1);
+    Components { labels, sizes }
 }
 
 /// The selection, and everything connected to it.
@@ -93,9 +93,9 @@ pub(super) fn connected(draft: &Draft, selected: &Selection, gap: Option<f64>) -
     let components = components(draft, gap);
     let mut reached = vec![false; components.sizes.len()];
     for i in selected.indices() {
-        reached[components.of[i as usize] as usize] = true;
+        reached[components.labels[i as usize] as usize] = true;
     }
-    Selection::of(draft.len(), |i| reached[components.of[i] as usize])
+    Selection::of(draft.len(), |i| reached[components.labels[i] as usize])
 }
 
 /// The splats in components of `min` to `max` splats.
@@ -103,12 +103,12 @@ pub(super) fn clusters(draft: &Draft, min: Option<usize>, max: Option<usize>, ga
     let components = components(draft, gap);
     let range = min.unwrap_or(0)..=max.unwrap_or(usize::MAX);
     Selection::of(draft.len(), |i| {
-        range.contains(&components.sizes[components.of[i] as usize])
+        range.contains(&components.sizes[components.labels[i] as usize])
     })
 }
 
 /// Median distance of splats to their nearest neighbours, dataset units; 1 if there are fewer than two.
-pub(crate) fn usual_distance(draft: &Draft) -> f64 {
+pub(crate) fn median_neighbour_distance(draft: &Draft) -> f64 {
     let means = &draft.cloud.means;
     if means.len() < 2 {
         return 1.0;

@@ -1,14 +1,14 @@
 //! Floaters of five kinds in a scene of surfaces.
 
-use crate::{cameras, make};
+use crate::{apply_line, cameras};
 use glam::{Quat, Vec3};
-use irradia_edit::{Draft, Photographs, Taken, floater_scores};
+use irradia_edit::{Draft, LoadedPhotographs, Photographs, floater_scores};
 use irradia_scene::{GaussianCloud, Photo, Rng, sh};
 use irradia_splat::{RenderOptions, Renderer, Splats, ViewParams, logit};
 
 const KINDS: [&str; 5] = ["isolated", "needle", "huge", "unseen", "in front"];
 /// Number of floaters of each kind.
-const EACH: usize = 100;
+const FLOATERS_PER_KIND: usize = 100;
 
 fn push(cloud: &mut GaussianCloud, mean: Vec3, scales: [f32; 3], rotation: Quat, opacity: f32, color: f32) {
     cloud.means.push(mean.to_array());
@@ -51,12 +51,12 @@ fn scene(scale: f32) -> Draft {
     Draft::new(cloud, cameras)
 }
 
-/// Adds [`EACH`] floaters of each kind.
+/// Adds [`FLOATERS_PER_KIND`] floaters of each kind.
 fn plant(draft: &Draft, scale: f32) -> Draft {
     let mut cloud = draft.cloud.clone();
     let mut rng = Rng::new(8, 0);
     for kind in 0..KINDS.len() {
-        for _ in 0..EACH {
+        for _ in 0..FLOATERS_PER_KIND {
             let camera = &draft.cameras[rng.below(8) as usize];
             let k = camera.intrinsics;
             let pixel = glam::Vec2::new(
@@ -112,7 +112,7 @@ fn planted_floaters_are_found_and_the_scene_stays() {
     let found = |range: std::ops::Range<usize>| scores[range].iter().filter(|score| score.score() >= 1.0).count();
     assert!(found(0..n) * 100 <= n, "{} of {n} splats lost", found(0..n));
     let each: Vec<usize> = (0..KINDS.len())
-        .map(|kind| found(n + EACH * kind..n + EACH * (kind + 1)))
+        .map(|kind| found(n + FLOATERS_PER_KIND * kind..n + FLOATERS_PER_KIND * (kind + 1)))
         .collect();
     let all: usize = each.iter().sum();
     assert!(
@@ -123,7 +123,7 @@ fn planted_floaters_are_found_and_the_scene_stays() {
     assert!(each.iter().all(|found| *found >= 90), "{each:?}");
     // A clean scene has almost no floaters.
     let mut same = clean.clone();
-    make(&mut same, "delete floaters");
+    apply_line(&mut same, "delete floaters");
     assert!(same.len() * 1000 >= n * 999);
 }
 
@@ -152,7 +152,7 @@ fn without_cameras_geometry_finds_what_it_can() {
     let found = |range: std::ops::Range<usize>| scores[range].iter().filter(|score| score.score() >= 1.0).count();
     assert!(found(0..n) * 1000 <= n);
     // Splats far from everything are found; those that only a view shows to be in front, or large relative to a camera, are not.
-    let unseen = found(n + 3 * EACH..n + 4 * EACH);
+    let unseen = found(n + 3 * FLOATERS_PER_KIND..n + 4 * FLOATERS_PER_KIND);
     assert!(unseen >= 90, "{unseen}");
 }
 
@@ -175,7 +175,7 @@ fn photographs(draft: &Draft) -> Photographs {
     };
     let photos = draft.cameras.iter().enumerate().map(&mut photo).collect();
     Photographs::new(move || {
-        Some(Taken {
+        Some(LoadedPhotographs {
             photos,
             background: [0.0; 3],
         })
@@ -198,7 +198,7 @@ fn photographs_tell_a_wall_from_a_veil() {
     );
     let clean = Draft::new(clean.cloud, clean.cameras);
     let mut planted = plant(&clean, 1.0);
-    let veils = wall + 1 + 2 * EACH..wall + 1 + 3 * EACH;
+    let veils = wall + 1 + 2 * FLOATERS_PER_KIND..wall + 1 + 3 * FLOATERS_PER_KIND;
     let is_found = |draft: &Draft| {
         let scores: Vec<f32> = floater_scores(draft).iter().map(|score| score.score()).collect();
         let found = scores[veils.clone()].iter().filter(|score| **score >= 1.0).count();
@@ -217,8 +217,8 @@ fn photographs_tell_a_wall_from_a_veil() {
         "{wall_is_found} {found} {lost}"
     );
     // A scene that no longer matches its photographs is not judged by them; deleting leaves the rest unchanged.
-    crate::make(&mut planted, "delete sphere center=0,0,0 radius=0.1");
+    crate::apply_line(&mut planted, "delete sphere center=0,0,0 radius=0.1");
     assert!(planted.photographs.is_some());
-    crate::make(&mut planted, "recolor exposure=1");
+    crate::apply_line(&mut planted, "recolor exposure=1");
     assert!(planted.photographs.is_none());
 }

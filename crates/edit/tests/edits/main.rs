@@ -51,7 +51,7 @@ fn cameras() -> Vec<Camera> {
 }
 
 /// Applies the edit of a line of text.
-fn make(draft: &mut Draft, line: &str) -> Applied {
+fn apply_line(draft: &mut Draft, line: &str) -> Applied {
     let edit: Edit = line.parse().unwrap_or_else(|error| panic!("{line}: {error}"));
     apply(draft, &edit, &open_nothing).unwrap_or_else(|error| panic!("{line}: {error}"))
 }
@@ -59,7 +59,7 @@ fn make(draft: &mut Draft, line: &str) -> Applied {
 fn edited(draft: &Draft, lines: &[&str]) -> Draft {
     let mut draft = draft.clone();
     for line in lines {
-        make(&mut draft, line);
+        apply_line(&mut draft, line);
     }
     draft
 }

@@ -1,4 +1,4 @@
-use crate::{cloud, difference, draft, edited, make};
+use crate::{apply_line, cloud, difference, draft, edited};
 use glam::{DQuat, DVec3};
 use irradia_edit::{Draft, Edit, History, Operation, apply, open_nothing};
 use irradia_scene::{ExtraColumn, Scalar, Similarity};
@@ -145,7 +145,7 @@ fn locked_and_hidden_splats_are_left_alone_but_move_with_the_scene() {
         let fewest = edited(&marked, &["reduce count=1"]);
         match mark {
             "lock" => assert_eq!(fewest.len(), upper, "what is locked counts and stays"),
-            _ => assert_eq!((fewest.len(), fewest.shown().len()), (upper + 1, 1)),
+            _ => assert_eq!((fewest.len(), fewest.visible_cloud().len()), (upper + 1, 1)),
         }
         let moved = edited(&marked, &["move by=0,0,1"]);
         assert!(
@@ -158,9 +158,9 @@ fn locked_and_hidden_splats_are_left_alone_but_move_with_the_scene() {
         );
     }
     let hidden = edited(&before, &["hide all"]);
-    assert_eq!((hidden.len(), hidden.shown().len()), (200, 0));
+    assert_eq!((hidden.len(), hidden.visible_cloud().len()), (200, 0));
     let partly = edited(&hidden, &["show sphere center=0,0,0 radius=0.5"]);
-    assert!((1..200).contains(&partly.shown().len()));
+    assert!((1..200).contains(&partly.visible_cloud().len()));
 }
 
 /// Numbers 0, 1, .. as an extra column.
@@ -184,11 +184,11 @@ fn what_files_have_beyond_ours_follows_its_splats() {
         place && draft.cloud.extra[0].get(i) == (label as u16).to_le_bytes()
     };
     let mut history = History::new(draft);
-    let mut make = |line: &str| history.apply(&line.parse().unwrap(), &|_| Ok(other.clone())).map(drop);
-    make("delete half-space point=0,0,0 normal=1,0,0").unwrap();
-    make("duplicate half-space point=0,0,0 normal=0,1,0").unwrap();
-    make("merge file=other").unwrap();
-    make("recolor exposure=1").unwrap();
+    let mut edit = |line: &str| history.apply(&line.parse().unwrap(), &|_| Ok(other.clone())).map(drop);
+    edit("delete half-space point=0,0,0 normal=1,0,0").unwrap();
+    edit("duplicate half-space point=0,0,0 normal=0,1,0").unwrap();
+    edit("merge file=other").unwrap();
+    edit("recolor exposure=1").unwrap();
     let now = history.draft();
     let label = |i: usize| u16::from_le_bytes(now.cloud.extra[0].get(i).try_into().unwrap()) as usize;
     let n = now.len() - 10;
@@ -206,14 +206,14 @@ fn what_files_have_beyond_ours_follows_its_splats() {
 fn copies_merges_and_splits_count_up() {
     let before = draft(100, 2);
     let mut doubled = before.clone();
-    let applied = make(&mut doubled, "duplicate by=5,0,0");
+    let applied = apply_line(&mut doubled, "duplicate by=5,0,0");
     assert_eq!(doubled.len(), 200);
     assert_eq!(applied.provenance.source(150), Some(50));
     assert!(!applied.provenance.changed.contains(99) && applied.provenance.changed.contains(100));
     assert!((doubled.cloud.means[150][0] - before.cloud.means[50][0] - 5.0).abs() < 1e-5);
     // Only the copy is to the right.
     let mut split = doubled.clone();
-    let applied = make(&mut split, "split name=copy half-space point=2.5,0,0 normal=1,0,0");
+    let applied = apply_line(&mut split, "split name=copy half-space point=2.5,0,0 normal=1,0,0");
     assert_eq!(split.cloud, before.cloud);
     let (name, cloud) = applied.split.expect("a second scene");
     assert_eq!((name.as_str(), cloud.len()), ("copy", 100));
@@ -255,13 +255,13 @@ fn lengths_and_up_are_as_told() {
     for (axis, to) in [("-y", DVec3::NEG_Y), ("y", DVec3::Y), ("z", DVec3::Z)] {
         let mut turned = before.clone();
         let line = format!("upright up=1,2,-0.5 ground=0.3,0.2,0.1 axis={axis}");
-        let moved = make(&mut turned, &line).moved.expect("the whole scene");
+        let moved = apply_line(&mut turned, &line).moved.expect("the whole scene");
         assert!((moved.rotation * up - to).length() < 1e-9);
         assert!(moved.apply(point).dot(to).abs() < 1e-9, "the ground is at height 0");
     }
     // Up is found from the cameras, where it is near -y, since there is no plane.
     let mut turned = before.clone();
-    let applied = make(&mut turned, "upright");
+    let applied = apply_line(&mut turned, "upright");
     let Operation::Upright { up: Some(up), .. } = applied.edit.op else {
         panic!("what was found is written out")
     };

@@ -1,6 +1,6 @@
 //! Rendering of edited scenes: if the scene and the camera move alike, nothing changes.
 
-use crate::{cameras, draft, make};
+use crate::{apply_line, cameras, draft};
 use irradia_edit::Draft;
 use irradia_scene::Camera;
 use irradia_splat::{RenderOptions, Renderer, Splats, ViewParams};
@@ -8,7 +8,7 @@ use irradia_splat::{RenderOptions, Renderer, Splats, ViewParams};
 /// Colour, `[3, H, W]`.
 fn render(draft: &Draft, camera: &Camera) -> Vec<f32> {
     let mut renderer = Renderer::new();
-    let splats = Splats::from_cloud(&draft.shown());
+    let splats = Splats::from_cloud(&draft.visible_cloud());
     renderer.render(&splats, &ViewParams::new(camera), &RenderOptions::default());
     renderer.color().to_vec()
 }
@@ -32,7 +32,7 @@ fn a_moved_scene_renders_as_its_moved_cameras_see_it() {
         "set-length from=0,0,0 to=0,0,1 length=250",
     ] {
         let mut after = before.clone();
-        make(&mut after, line);
+        apply_line(&mut after, line);
         for (old, new) in before.cameras.iter().zip(&after.cameras) {
             let (a, b) = (render(&before, old), render(&after, new));
             assert!(a.iter().any(|v| *v > 0.2));
@@ -43,7 +43,7 @@ fn a_moved_scene_renders_as_its_moved_cameras_see_it() {
     }
     // Not everything renders alike.
     let mut turned = before.clone();
-    make(&mut turned, "rotate axis=1,2,3 degrees=77");
+    apply_line(&mut turned, "rotate axis=1,2,3 degrees=77");
     assert!(
         psnr(
             &render(&before, &before.cameras[0]),
@@ -56,7 +56,7 @@ fn a_moved_scene_renders_as_its_moved_cameras_see_it() {
 fn a_rotated_scene_without_its_harmonics_rotated_would_be_noticed() {
     let before = draft(400, 3);
     let mut after = before.clone();
-    make(&mut after, "rotate axis=1,2,3 degrees=77");
+    apply_line(&mut after, "rotate axis=1,2,3 degrees=77");
     let mut wrong = after.clone();
     wrong.cloud.sh = before.cloud.sh.clone();
     let (a, b) = (render(&before, &before.cameras[0]), render(&wrong, &after.cameras[0]));
@@ -69,7 +69,7 @@ fn hiding_looks_like_deleting_and_splitting_leaves_the_rest() {
     let shape = "sphere center=0.3,0,0 radius=0.6";
     let after = |op: &str| {
         let mut after = before.clone();
-        make(&mut after, &format!("{op} {shape}"));
+        apply_line(&mut after, &format!("{op} {shape}"));
         render(&after, &before.cameras[0])
     };
     assert_eq!(after("hide"), after("delete"));
@@ -84,11 +84,11 @@ fn exposure_multiplies_the_picture_and_grey_is_grey() {
     before.cloud.sh.iter_mut().for_each(|value| *value *= 0.1);
     let camera = &cameras()[2];
     let mut after = before.clone();
-    make(&mut after, "recolor exposure=2.2");
+    apply_line(&mut after, "recolor exposure=2.2");
     let (a, b) = (render(&before, camera), render(&after, camera));
     assert!(a.iter().zip(&b).all(|(a, b)| (2.0 * a - b).abs() < 1e-4));
     let mut grey = before.clone();
-    make(&mut grey, "recolor saturation=0");
+    apply_line(&mut grey, "recolor saturation=0");
     let picture = render(&grey, camera);
     let n = picture.len() / 3;
     assert!(
@@ -100,7 +100,7 @@ fn exposure_multiplies_the_picture_and_grey_is_grey() {
 fn a_smaller_opacity_shows_more_of_the_background() {
     let before = draft(300, 0);
     let mut after = before.clone();
-    make(&mut after, "opacity factor=0.2");
+    apply_line(&mut after, "opacity factor=0.2");
     let sum = |draft: &Draft| {
         let mut renderer = Renderer::new();
         let view = ViewParams::new(&before.cameras[0]);

@@ -2,7 +2,7 @@ use crate::{cloud, draft};
 use irradia_edit::{Draft, Edit, EditList, History, Provenance, apply};
 use irradia_scene::{GaussianCloud, Rng};
 
-const LINES: [&str; 16] = [
+const EDIT_LINES: [&str; 16] = [
     "delete sphere center=0.4,0,0 radius=0.4",
     "move by=0.1,0,0 half-space point=0,0,0 normal=0,0,1",
     "rotate axis=1,1,0 degrees=33",
@@ -37,7 +37,7 @@ fn every_edit_is_undone_to_the_bit_and_replayed() {
         let mut history = History::new(before.clone());
         let mut states = vec![before.clone()];
         for _ in 0..8 {
-            let line = LINES[rng.below(LINES.len() as u32) as usize];
+            let line = EDIT_LINES[rng.below(EDIT_LINES.len() as u32) as usize];
             let edit: Edit = line.parse().unwrap();
             history.apply(&edit, &open).unwrap();
             states.push(history.draft().clone());
@@ -76,7 +76,7 @@ fn provenance_says_from_where_every_splat_comes() {
     let before = draft(200, 1);
     let mut history = History::new(before.clone());
     let mut total = Provenance::identity(before.len());
-    for line in LINES {
+    for line in EDIT_LINES {
         let from = history.draft().clone();
         let applied = history.apply(&line.parse().unwrap(), &open).unwrap();
         check(&from, history.draft(), &applied.provenance);
@@ -99,5 +99,5 @@ fn a_failed_edit_changes_nothing_and_forgets_nothing() {
     history.undo();
     let before = history.draft().clone();
     assert!(history.apply(&"merge file=missing".parse().unwrap(), &open).is_err());
-    assert_eq!((history.draft(), history.undone()), (&before, 1));
+    assert_eq!((history.draft(), history.redo_count()), (&before, 1));
 }

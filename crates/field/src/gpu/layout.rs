@@ -4,9 +4,9 @@ use crate::mlp::Mlp;
 use crate::net::Net;
 
 /// Minimum number of samples over which a workgroup sums the gradients of weights; a multiple of 32.
-const CHUNK: usize = 256;
+const MIN_CHUNK: usize = 256;
 /// Maximum number of chunks; each needs memory for the gradients of all weights.
-pub(super) const CHUNKS: usize = 128;
+pub(super) const MAX_CHUNKS: usize = 128;
 
 /// One layer, as `Layer` in `layer.wgsl`.
 #[derive(Clone, Copy, Debug)]
@@ -37,7 +37,7 @@ impl DeviceLayer {
 
 /// Number of samples per chunk.
 pub(super) fn chunk(samples: usize) -> usize {
-    samples.div_ceil(CHUNKS).next_multiple_of(32).max(CHUNK)
+    samples.div_ceil(MAX_CHUNKS).next_multiple_of(32).max(MIN_CHUNK)
 }
 
 /// The rows of all layers. The encoded direction follows the density and the geometry features, so that the colour network reads its

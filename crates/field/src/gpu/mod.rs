@@ -42,14 +42,14 @@ pub fn supports(config: &FieldConfig) -> bool {
 }
 
 /// Workgroup sizes of kernels with one thread per ray, and of those with one thread per sample.
-const RAYS: usize = 64;
-const SAMPLES: usize = 256;
+const RAY_GROUP: usize = 64;
+const SAMPLE_GROUP: usize = 256;
 /// Number of words of a ray, and the positions of its distances: see `ray.wgsl`.
-const RAY: usize = 20;
-const NEAR: usize = 3;
-const FAR: usize = 7;
+const RAY_WORDS: usize = 20;
+const NEAR_WORD: usize = 3;
+const FAR_WORD: usize = 7;
 /// Maximum number of samples per ray: in normalised device coordinates, rays of cameras outside the capture may have any length.
-const MOST_SAMPLES: usize = 1 << 14;
+const MAX_SAMPLES: usize = 1 << 14;
 
 /// The forward pass of a field.
 pub(crate) struct GpuField {
@@ -58,7 +58,7 @@ pub(crate) struct GpuField {
     pub layout: Layout,
     steps: Steps,
     /// Maximum number of samples per ray in the last march.
-    most: usize,
+    samples_per_ray: usize,
     /// The field's part of `Task` in `task.wgsl`.
     task_of_field: TaskOfField,
     pub table: Array,
@@ -92,8 +92,8 @@ struct TaskOfField {
 
 /// Rays of a batch, and weights of the losses.
 pub(crate) struct Batch {
-    /// One ray each, [`RAY`] words.
-    pub rays: Vec<[f32; RAY]>,
+    /// One ray each, [`RAY_WORDS`] words.
+    pub rays: Vec<[f32; RAY_WORDS]>,
     /// Weights of a ray and of a known distance in the loss.
     pub weights: [f32; 2],
 }
@@ -139,13 +139,13 @@ impl GpuField {
         let made = Self {
             kernels: Kernels::new(&gpu, &layout.constants(net)),
             steps: options.steps,
-            most: 0,
+            samples_per_ray: 0,
             task_of_field,
             table: Array::zeros(&gpu, "the hash table's entries", parameters.table.len()),
             nets: Array::zeros(&gpu, "networks", layout.parameters),
             background: Array::zeros(&gpu, "background", field.background.len()),
             bricks: Array::zeros(&gpu, "occupied cells", 2 * (side / 4).pow(3)),
-            task: Array::zeros(&gpu, "task", TASK),
+            task: Array::zeros(&gpu, "task", TASK_WORDS),
             layers: layout.layers.iter().map(|_| Array::zeros(&gpu, "layer", 16)).collect(),
             rays: array("rays"),
             middles: array("samples of rays"),
@@ -185,10 +185,10 @@ impl GpuField {
     pub fn march(&mut self, batch: &Batch) -> usize {
         let gpu = self.gpu.clone();
         let rays = batch.rays.len();
-        self.rays.reserve(&gpu, RAY * rays);
+        self.rays.reserve(&gpu, RAY_WORDS * rays);
         self.rays.write(&gpu, 0, batch.rays.as_flattened());
-        self.most = self.most_samples(batch);
-        self.middles.reserve(&gpu, self.most * rays);
+        self.samples_per_ray = self.max_samples(batch);
+        self.middles.reserve(&gpu, self.samples_per_ray * rays);
         self.counts.reserve(&gpu, rays + 1);
         self.starts.reserve(&gpu, rays + 1);
         self.write_task(rays, 0, batch.weights);
@@ -204,7 +204,7 @@ impl GpuField {
             &self.middles,
             &self.counts,
         ];
-        work.run(&self.kernels.march, &arrays, rays.div_ceil(RAYS));
+        work.run(&self.kernels.march, &arrays, rays.div_ceil(RAY_GROUP));
         self.scan
             .run(&mut work, &self.scan_params, &self.counts, &self.starts, rays + 1);
         work.submit();
@@ -214,9 +214,9 @@ impl GpuField {
     }
 
     /// Maximum number of steps along any ray of `batch`.
-    pub fn most_samples(&self, batch: &Batch) -> usize {
+    pub fn max_samples(&self, batch: &Batch) -> usize {
         let Steps { shortest, cone } = self.steps;
-        let spans = batch.rays.iter().map(|words| (words[NEAR], words[FAR]));
+        let spans = batch.rays.iter().map(|words| (words[NEAR_WORD], words[FAR_WORD]));
         let most = spans.fold(0.0f32, |most, (near, far)| {
             // Even steps up to here, then steps that grow with distance.
             let even = if cone > 0.0 { (shortest / cone).max(near) } else { far };
@@ -227,7 +227,7 @@ impl GpuField {
             };
             most.max((even.min(far) - near) / shortest + growing)
         });
-        (most.ceil() as usize + 2).min(MOST_SAMPLES)
+        (most.ceil() as usize + 2).min(MAX_SAMPLES)
     }
 
     /// Makes room for the `samples` of the last march, that of `batch`.
@@ -256,7 +256,7 @@ impl GpuField {
             &self.points,
             &self.rows,
         ];
-        work.run(&self.kernels.gather, &arrays, rays.div_ceil(RAYS));
+        work.run(&self.kernels.gather, &arrays, rays.div_ceil(RAY_GROUP));
         self.encode(work, samples);
         for layer in 0..self.layers.len() {
             self.forward(work, layer, samples);
@@ -264,13 +264,13 @@ impl GpuField {
     }
 
     fn encode(&self, work: &mut Work, samples: usize) {
-        let groups = samples.div_ceil(SAMPLES) * self.levels();
+        let groups = samples.div_ceil(SAMPLE_GROUP) * self.levels();
         let arrays = [&self.task, &self.points, &self.table, &self.rows];
         work.run(&self.kernels.encode, &arrays, groups);
     }
 
     fn forward(&self, work: &mut Work, layer: usize, samples: usize) {
-        let groups = samples.div_ceil(SAMPLES) * (self.layout.layers[layer].padded / 8);
+        let groups = samples.div_ceil(SAMPLE_GROUP) * (self.layout.layers[layer].padded / 8);
         let arrays = [&self.layers[layer], &self.nets, &self.rows];
         work.run(&self.kernels.dense, &arrays, groups);
     }
@@ -293,8 +293,8 @@ impl GpuField {
         let gpu = self.gpu.clone();
         let shape = &field.nets[0].shape;
         let mut densities = Vec::with_capacity(points.len());
-        self.make_room(points.len().min(QUERIED));
-        for points in points.chunks(QUERIED) {
+        self.make_room(points.len().min(POINTS_PER_QUERY));
+        for points in points.chunks(POINTS_PER_QUERY) {
             let samples = points.len();
             for c in 0..3 {
                 let plane: Vec<f32> = points.iter().map(|point| point[c]).collect();
@@ -326,7 +326,7 @@ impl GpuField {
 
     fn write_task(&self, rays: usize, samples: usize, weights: [f32; 2]) {
         let of = &self.task_of_field;
-        let sizes = [rays, samples, self.stride, self.most].map(|n| n as u32);
+        let sizes = [rays, samples, self.stride, self.samples_per_ray].map(|n| n as u32);
         let loss = [weights[0], weights[1], 0.0, 0.0].map(f32::to_bits);
         let mut words = vec![sizes, of.space, of.rows, of.march, loss];
         words.extend_from_slice(&of.levels);
@@ -341,8 +341,8 @@ impl GpuField {
 
     /// The words of a ray. `goal` is its target colour and known distance (in training), or the conversion of its distances to the world
     /// (in rendering); `behind` is the background, and whether a learnt one takes precedence.
-    pub fn ray(ray: &Ray, offset: f32, goal: [f32; 4], behind: [f32; 4]) -> [f32; RAY] {
-        let mut words = [0.0; RAY];
+    pub fn ray(ray: &Ray, offset: f32, goal: [f32; 4], behind: [f32; 4]) -> [f32; RAY_WORDS] {
+        let mut words = [0.0; RAY_WORDS];
         let parts = [(&ray.origin, ray.near), (&ray.direction, ray.far), (&ray.view, offset)];
         for (to, (vector, number)) in words.chunks_exact_mut(4).zip(parts) {
             to[..3].copy_from_slice(vector);
@@ -358,20 +358,20 @@ impl GpuField {
     }
 
     /// Number of rays of `batch` that fit into one array with room for the maximum number of samples each.
-    pub fn most_rays(&self, batch: &Batch) -> usize {
-        (self.gpu.info().largest_array / 4) as usize / self.most_samples(batch)
+    pub fn max_rays(&self, batch: &Batch) -> usize {
+        (self.gpu.info().largest_array / 4) as usize / self.max_samples(batch)
     }
 
     /// Number of samples whose activations fit into one array.
-    pub fn most_at_once(&self) -> usize {
+    pub fn max_batch_samples(&self) -> usize {
         (self.gpu.info().largest_array / 4) as usize / self.layout.rows * 4 / 5
     }
 }
 
 /// Number of words of `Task` in `task.wgsl`.
-const TASK: usize = 4 * (5 + 32);
+const TASK_WORDS: usize = 4 * (5 + 32);
 /// Number of points per evaluation of densities.
-const QUERIED: usize = 1 << 16;
+const POINTS_PER_QUERY: usize = 1 << 16;
 
 #[cfg(test)]
 mod tests;

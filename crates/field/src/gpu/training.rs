@@ -1,7 +1,7 @@
 //! Training of a field on a GPU: the twin of [`crate::train_step`].
 
-use super::layout::{CHUNKS, chunk};
-use super::{Batch, GpuField, RAYS, SAMPLES};
+use super::layout::{MAX_CHUNKS, chunk};
+use super::{Batch, GpuField, RAY_GROUP, SAMPLE_GROUP};
 use crate::batch::RayBatch;
 use crate::field::Field;
 use crate::state::FieldState;
@@ -18,7 +18,7 @@ pub struct GpuFieldTraining {
     v_rows: Array,
     losses: Array,
     totals: Array,
-    /// Gradients of the networks, `[CHUNKS, parameters]`.
+    /// Gradients of the networks, `[MAX_CHUNKS, parameters]`.
     chunks: Array,
     /// Gradients of the table, two words each, zero between steps.
     table_sums: Array,
@@ -84,7 +84,7 @@ impl GpuFieldTraining {
             v_rows: array("gradients of activations"),
             losses: array("losses of rays"),
             totals: Array::zeros(&gpu, "totals", 2),
-            chunks: Array::zeros(&gpu, "gradients of networks", CHUNKS * field.layout.parameters),
+            chunks: Array::zeros(&gpu, "gradients of networks", MAX_CHUNKS * field.layout.parameters),
             table_sums: Array::zeros(&gpu, "gradients of the hash table", 2 * state.moments[0][0].table.len()),
             table: Trained::new(&gpu, state.moments.each_ref().map(|moment| &moment[0].table[..])),
             nets: Trained::new(&gpu, of_nets.each_ref().map(|moment| &moment[..])),
@@ -113,7 +113,7 @@ impl GpuFieldTraining {
         let mut work = Work::new(&gpu);
         field.evaluate(&mut work, rays, samples);
         let arrays = field.composited(&[&self.v_rows, &self.losses]);
-        work.run(&field.kernels.composite, &arrays, rays.div_ceil(RAYS));
+        work.run(&field.kernels.composite, &arrays, rays.div_ceil(RAY_GROUP));
         work.run(&field.kernels.totals, &[&field.task, &self.losses, &self.totals], 1);
         self.propagate(&mut work, samples);
         self.update(&mut work, options, &adam_step(options, state.step), [rays, samples]);
@@ -136,11 +136,11 @@ impl GpuFieldTraining {
             let tiles = of.inputs.div_ceil(32) * of.outputs.div_ceil(32);
             let arrays = [layer, &field.rows, &self.v_rows, &self.chunks];
             work.run(&field.kernels.weights_vjp, &arrays, chunks(samples) * tiles);
-            let groups = samples.div_ceil(SAMPLES) * of.wanted.div_ceil(8);
+            let groups = samples.div_ceil(SAMPLE_GROUP) * of.wanted.div_ceil(8);
             let arrays = [layer, &field.nets, &field.rows, &self.v_rows];
             work.run(&field.kernels.dense_vjp, &arrays, groups);
         }
-        let groups = samples.div_ceil(SAMPLES) * field.levels();
+        let groups = samples.div_ceil(SAMPLE_GROUP) * field.levels();
         let arrays = [&field.task, &field.points, &self.v_rows, &self.table_sums];
         work.run(&field.kernels.scatter, &arrays, groups);
     }

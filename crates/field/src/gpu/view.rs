@@ -1,6 +1,6 @@
 //! Rendering of a field on a GPU: the twin of [`crate::render_view`], without normals.
 
-use super::{Batch, GpuField, RAYS};
+use super::{Batch, GpuField, RAY_GROUP};
 use crate::field::Field;
 use crate::render::view::{FieldView, RenderOptions, camera_ray};
 use crate::space::Measure;
@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use std::sync::Arc;
 
 /// Maximum number of rays per batch.
-const BATCH: usize = 1 << 15;
+const MAX_BATCH_RAYS: usize = 1 << 15;
 
 /// A field on a GPU, for rendering.
 pub struct GpuFieldRenderer {
@@ -33,7 +33,7 @@ impl GpuFieldRenderer {
         Ok(Self {
             pixels: Array::zeros(&gpu, "pixels", 0),
             field: GpuField::new(gpu, field)?,
-            batch: BATCH,
+            batch: MAX_BATCH_RAYS,
         })
     }
 
@@ -55,13 +55,13 @@ impl GpuFieldRenderer {
         while at < count {
             let rays = self.batch.min(count - at);
             let batch = batch_of(field, camera, options, at, &mut cosines[at..at + rays]);
-            let most = self.field.most_rays(&batch);
-            if rays > most && rays > 1 {
-                self.batch = most.max(1);
+            let max_rays = self.field.max_rays(&batch);
+            if rays > max_rays && rays > 1 {
+                self.batch = max_rays.max(1);
                 continue;
             }
             let samples = self.field.march(&batch);
-            if samples > self.field.most_at_once() && rays > 1 {
+            if samples > self.field.max_batch_samples() && rays > 1 {
                 self.batch = rays / 2;
                 continue;
             }
@@ -96,7 +96,7 @@ impl GpuFieldRenderer {
         let mut work = Work::new(&gpu);
         field.evaluate(&mut work, rays, samples);
         let arrays = field.composited(&[&self.pixels]);
-        work.run(&field.kernels.pixels, &arrays, rays.div_ceil(RAYS));
+        work.run(&field.kernels.pixels, &arrays, rays.div_ceil(RAY_GROUP));
         work.submit();
         self.pixels.to_vec(&gpu, 6 * rays)
     }

@@ -17,7 +17,7 @@ use product::{Begin, Finish, pack, product};
 /// Samples per panel.
 pub const PANEL: usize = 32;
 /// Widths are padded to a multiple of this.
-pub const ROWS: usize = 8;
+pub const TILE_ROWS: usize = 8;
 
 /// The sizes of a network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -34,19 +34,19 @@ pub struct MlpShape {
     pub skip: Option<usize>,
 }
 
-/// Position of a layer in the flat list of parameters: weights `[inputs + again, outputs]`, then the bias.
+/// Position of a layer in the flat list of parameters: weights `[inputs + skip_inputs, outputs]`, then the bias.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Layer {
     pub inputs: usize,
     /// Rows of the network's input taken as additional input (0 or all of it).
-    again: usize,
+    skip_inputs: usize,
     pub outputs: usize,
     pub at: usize,
 }
 
 impl Layer {
     fn weights(&self) -> usize {
-        (self.inputs + self.again) * self.outputs
+        (self.inputs + self.skip_inputs) * self.outputs
     }
     pub fn bias(&self) -> usize {
         self.at + self.weights()
@@ -95,13 +95,13 @@ impl<T: Scalar> MlpTape<T> {
 impl Mlp {
     /// Lays out a network.
     pub fn new(shape: MlpShape) -> Self {
-        let pad = |n: usize| n.next_multiple_of(ROWS);
+        let pad = |n: usize| n.next_multiple_of(TILE_ROWS);
         let inputs = pad(shape.inputs);
         let mut layers: Vec<Layer> = Vec::new();
         for l in 0..=shape.depth {
             layers.push(Layer {
                 inputs: if l == 0 { inputs } else { pad(shape.width) },
-                again: if l > 0 && l < shape.depth && shape.skip == Some(l) {
+                skip_inputs: if l > 0 && l < shape.depth && shape.skip == Some(l) {
                     inputs
                 } else {
                     0
@@ -157,9 +157,9 @@ impl Mlp {
             };
             let last = l == self.shape.depth;
             let outputs = if last { self.shape.outputs } else { self.shape.width };
-            let again = if layer.again > 0 { self.shape.inputs } else { 0 };
-            let bound = (if last { 3.0 } else { 6.0 } / (inputs + again) as f32).sqrt();
-            for i in (0..inputs).chain(layer.inputs..layer.inputs + again) {
+            let skip_inputs = if layer.skip_inputs > 0 { self.shape.inputs } else { 0 };
+            let bound = (if last { 3.0 } else { 6.0 } / (inputs + skip_inputs) as f32).sqrt();
+            for i in (0..inputs).chain(layer.inputs..layer.inputs + skip_inputs) {
                 for o in 0..outputs {
                     parameters[layer.at + i * layer.outputs + o] = rng.range(-bound, bound);
                 }
@@ -170,15 +170,15 @@ impl Mlp {
 
     /// The transposed weights, at the same offsets, so that the backward pass can use the forward pass's product kernel.
     ///
-    /// Each layer is packed into tiles `[(inputs + again) / 8, outputs, 8]`.
+    /// Each layer is packed into tiles `[(inputs + skip_inputs) / 8, outputs, 8]`.
     pub fn transposed<T: Scalar>(&self, parameters: &[T]) -> Vec<T> {
         let mut transposed = vec![T::default(); parameters.len()];
         for layer in &self.layers {
             let weights = &parameters[layer.at..layer.bias()];
-            let tiles = transposed[layer.at..layer.bias()].as_chunks_mut::<ROWS>().0;
+            let tiles = transposed[layer.at..layer.bias()].as_chunks_mut::<TILE_ROWS>().0;
             for (i, row) in weights.chunks_exact(layer.outputs).enumerate() {
                 for (o, w) in row.iter().enumerate() {
-                    tiles[i / ROWS * layer.outputs + o][i % ROWS] = *w;
+                    tiles[i / TILE_ROWS * layer.outputs + o][i % TILE_ROWS] = *w;
                 }
             }
         }
@@ -204,7 +204,7 @@ impl Mlp {
                 Finish::Relu
             };
             for (p, to) in after[0].chunks_exact_mut(layer.outputs * PANEL).enumerate() {
-                let from = [panel(from, layer.inputs, p), panel(x, layer.again, p)];
+                let from = [panel(from, layer.inputs, p), panel(x, layer.skip_inputs, p)];
                 product(simd, &tape.packed, from, bias, finish, to);
             }
         }
@@ -227,7 +227,7 @@ impl Mlp {
         self.pull_back(simd, transposed, tape, v_x);
         for (l, layer) in self.layers.iter().enumerate() {
             let from = if l == 0 { x } else { &tape.outputs[l - 1] };
-            let from = [(from, layer.inputs), (x, layer.again)];
+            let from = [(from, layer.inputs), (x, layer.skip_inputs)];
             let v = (&tape.gradients[l][..], layer.outputs);
             outer(simd, from, v, &mut tape.packed, &mut grads[layer.at..layer.end()]);
         }

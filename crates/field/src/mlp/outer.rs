@@ -5,13 +5,13 @@
 //! the sample in the lane need no transpose, but sums across lanes at the end and twice the loads: with them the whole backward
 //! pass reached half of peak FMA throughput on AVX-512; this way it reaches 60 to 75 %, depending on width.
 
-use super::{PANEL, ROWS};
+use super::{PANEL, TILE_ROWS};
 use crate::{Num, Rows};
 use irradia_compute::simd::{Lanes, Simd};
 
 /// Panels at a time: a strip of 32 outputs is then 16 KiB and stays in the L1 cache while all inputs use it (a tenth faster at
 /// width 32 than all panels at a time, equal from 128 on).
-const BLOCK: usize = 4;
+const PANELS_PER_BLOCK: usize = 4;
 
 /// Adds to a layer's gradient `to`, weights `[inputs, outputs]` and bias: `to[i][o] += sum over samples of x[i][s] v[o][s]`.
 ///
@@ -25,8 +25,8 @@ pub(super) fn outer<S: Simd>(
     to: &mut [Num<S>],
 ) {
     let panels = v.len() / (outputs * PANEL);
-    for begin in (0..panels).step_by(BLOCK) {
-        let end = panels.min(begin + BLOCK);
+    for begin in (0..panels).step_by(PANELS_PER_BLOCK) {
+        let end = panels.min(begin + PANELS_PER_BLOCK);
         let part = |rows: usize| begin * rows * PANEL..end * rows * PANEL;
         let x = [(&x[0].0[part(x[0].1)], x[0].1), (&x[1].0[part(x[1].1)], x[1].1)];
         let v = &v[part(outputs)];
@@ -79,7 +79,7 @@ fn columns<S: Simd, const V: usize>(
     let mut rows = to.chunks_exact_mut(outputs);
     for (x, inputs) in x {
         let x = x.as_chunks::<PANEL>().0;
-        for i in (0..inputs).step_by(ROWS) {
+        for i in (0..inputs).step_by(TILE_ROWS) {
             // Eight rows per tile keep 16 accumulators of 16 lanes in registers; with fewer registers, four.
             if S::LANES == 16 {
                 let sums = tile::<S, 8, V>(simd, x, i, inputs, strip);

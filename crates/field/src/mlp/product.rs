@@ -4,7 +4,7 @@
 //! the layout of the parameters, with rows a layer's width apart, a width of 256 maps all rows of a tile to four sets of the L1
 //! cache.
 
-use super::{PANEL, ROWS};
+use super::{PANEL, TILE_ROWS};
 use crate::{Num, Rows};
 use irradia_compute::simd::{Lanes, Scalar, Simd};
 
@@ -31,9 +31,9 @@ pub(super) enum Finish<'a, T> {
 pub(super) fn pack<T: Scalar>(weights: &[T], outputs: usize, to: &mut Rows<T>) {
     to.resize(weights.len(), T::default());
     let inputs = weights.len() / outputs;
-    let tiles = to.as_chunks_mut::<ROWS>().0;
+    let tiles = to.as_chunks_mut::<TILE_ROWS>().0;
     for (i, row) in weights.chunks_exact(outputs).enumerate() {
-        for (o, w) in row.as_chunks::<ROWS>().0.iter().enumerate() {
+        for (o, w) in row.as_chunks::<TILE_ROWS>().0.iter().enumerate() {
             tiles[o * inputs + i] = *w;
         }
     }
@@ -68,13 +68,13 @@ fn tiles<S: Simd, const O: usize, const V: usize>(
     to: &mut [Num<S>],
 ) {
     let (first, again) = (x[0].as_chunks::<PANEL>().0, x[1].as_chunks::<PANEL>().0);
-    let (w, to) = (w.as_chunks::<ROWS>().0, to.as_chunks_mut::<PANEL>().0);
+    let (w, to) = (w.as_chunks::<TILE_ROWS>().0, to.as_chunks_mut::<PANEL>().0);
     let zero = simd.splat(0.0);
     let tiles = w.chunks_exact(first.len() + again.len());
-    for (tile, (w, to)) in tiles.zip(to.as_chunks_mut::<ROWS>().0).enumerate() {
+    for (tile, (w, to)) in tiles.zip(to.as_chunks_mut::<TILE_ROWS>().0).enumerate() {
         let (w_first, w_again) = w.split_at(first.len());
-        for o in (0..ROWS).step_by(O) {
-            let row = tile * ROWS + o;
+        for o in (0..TILE_ROWS).step_by(O) {
+            let row = tile * TILE_ROWS + o;
             for s in (0..PANEL).step_by(V * S::LANES) {
                 let mut sums = [[zero; V]; O];
                 match begin {
@@ -139,7 +139,7 @@ mod tests {
         let mut tiles = Rows::default();
         pack(&weights, outputs, &mut tiles);
         for (i, o) in (0..inputs).flat_map(|i| (0..outputs).map(move |o| (i, o))) {
-            let at = (o / ROWS * inputs + i) * ROWS + o % ROWS;
+            let at = (o / TILE_ROWS * inputs + i) * TILE_ROWS + o % TILE_ROWS;
             assert_eq!(tiles[at], weights[i * outputs + o], "input {i}, output {o}");
         }
     }

@@ -72,7 +72,7 @@ impl<T: Scalar> Block<T> {
         for rows in own.into_iter().chain(self.density_tape.outputs_mut()) {
             let height = rows.len() / (before * PANEL);
             for (to, from) in kept.iter().map(|k| *k as usize).enumerate() {
-                let (to, from) = (place(height, to), place(height, from));
+                let (to, from) = (sample_offset(height, to), sample_offset(height, from));
                 for row in 0..height {
                     rows[to + row * PANEL] = rows[from + row * PANEL];
                 }
@@ -84,14 +84,14 @@ impl<T: Scalar> Block<T> {
 
 /// Index of row 0 of sample `i` in panels of `rows` rows; the other rows follow at a stride of 32.
 #[inline(always)]
-pub fn place(rows: usize, i: usize) -> usize {
+pub fn sample_offset(rows: usize, i: usize) -> usize {
     i / PANEL * rows * PANEL + i % PANEL
 }
 
 /// Sets three rows of sample `i`.
 #[inline(always)]
 pub fn set3<T: Copy>(rows: &mut [T], i: usize, values: [T; 3]) {
-    let at = place(3, i);
+    let at = sample_offset(3, i);
     for c in 0..3 {
         rows[at + c * PANEL] = values[c];
     }
@@ -100,6 +100,6 @@ pub fn set3<T: Copy>(rows: &mut [T], i: usize, values: [T; 3]) {
 /// Three rows of sample `i`.
 #[inline(always)]
 pub fn get3<T: Copy>(rows: &[T], i: usize) -> [T; 3] {
-    let at = place(3, i);
+    let at = sample_offset(3, i);
     [rows[at], rows[at + PANEL], rows[at + 2 * PANEL]]
 }

@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 
 mod block;
 
-pub use block::{Block, get3, place, set3};
+pub use block::{Block, get3, sample_offset, set3};
 
 /// Activation that turns a network's first output into a density, in inverse field units.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -377,7 +377,7 @@ impl Net {
     pub fn code_gradient<T: Copy>(&self, block: &Block<T>, i: usize, k: usize) -> T {
         let (mlp, shape) = self.color_parts();
         let row = self.shape.geometry + shape.direction.features() + k;
-        block.v_color_in[place(mlp.inputs(), i) + row * PANEL]
+        block.v_color_in[sample_offset(mlp.inputs(), i) + row * PANEL]
     }
 
     /// Adds the tables' gradient from `points` and `v_encoded` of a block to `grads`, in sample order.

@@ -11,30 +11,30 @@ pub const TRANSMITTANCE_MIN: f64 = 1e-4;
 /// The number of leading intervals, after an initial `transmittance`, that begin above [`TRANSMITTANCE_MIN`], and the
 /// transmittance behind them. [`weights`] counts the same intervals.
 #[inline(always)]
-pub fn counted<T: Scalar>(through: &[T], mut transmittance: T) -> (usize, T) {
+pub fn counted<T: Scalar>(transmittances: &[T], mut transmittance: T) -> (usize, T) {
     let end = T::from_f64(TRANSMITTANCE_MIN);
-    for (i, e) in through.iter().enumerate() {
+    for (i, e) in transmittances.iter().enumerate() {
         if transmittance < end {
             return (i, transmittance);
         }
         transmittance = transmittance * *e;
     }
-    (through.len(), transmittance)
+    (transmittances.len(), transmittance)
 }
 
-/// Writes the weights of intervals of transmittance `through`, front to back, and returns how many count (the rest have weight
+/// Writes the weights of intervals of transmittance `transmittances`, front to back, and returns how many count (the rest have weight
 /// zero) and the transmittance behind them.
 #[inline(always)]
-pub fn weights<T: Scalar>(through: &[T], weights: &mut [T]) -> (usize, T) {
+pub fn weights<T: Scalar>(transmittances: &[T], weights: &mut [T]) -> (usize, T) {
     let one = T::from_f64(1.0);
-    let (count, remaining) = counted(through, one);
+    let (count, remaining) = counted(transmittances, one);
     let mut transmittance = one;
-    for (w, e) in weights.iter_mut().zip(&through[..count]) {
+    for (w, e) in weights.iter_mut().zip(&transmittances[..count]) {
         let next = transmittance * *e;
         *w = transmittance - next;
         transmittance = next;
     }
-    weights[count..through.len()].fill(T::default());
+    weights[count..transmittances.len()].fill(T::default());
     (count, remaining)
 }
 
@@ -44,7 +44,7 @@ pub fn weights<T: Scalar>(through: &[T], weights: &mut [T]) -> (usize, T) {
 /// `dw_i = T_i e_i`, and for every later interval `dw_j = -w_j`.
 #[inline(always)]
 pub fn weights_vjp<T: Scalar>(
-    through: &[T],
+    transmittances: &[T],
     weights: &[T],
     v_weights: &[T],
     counted: usize,
@@ -57,7 +57,7 @@ pub fn weights_vjp<T: Scalar>(
     let mut transmittance = T::from_f64(1.0);
     for i in 0..counted {
         later = later - v_weights[i] * weights[i];
-        let next = transmittance * through[i];
+        let next = transmittance * transmittances[i];
         v_optical_depth[i] = v_weights[i] * next - later;
         transmittance = next;
     }
@@ -69,8 +69,8 @@ pub fn weights_vjp<T: Scalar>(
 /// Discrete compositing of a whole ray, for experiments with the formula: from densities `[n]`, interval lengths `[n]` and
 /// values (a colour channel, a depth) `[n]` to the composite and alpha.
 pub fn composite(densities: &[f64], lengths: &[f64], values: &[f64]) -> (f64, f64) {
-    let through: Vec<f64> = densities.iter().zip(lengths).map(|(s, d)| (-s * d).exp()).collect();
-    let mut w = vec![0.0; through.len()];
-    let (_, transmittance) = weights(&through, &mut w);
+    let transmittances: Vec<f64> = densities.iter().zip(lengths).map(|(s, d)| (-s * d).exp()).collect();
+    let mut w = vec![0.0; transmittances.len()];
+    let (_, transmittance) = weights(&transmittances, &mut w);
     (w.iter().zip(values).map(|(w, v)| w * v).sum(), 1.0 - transmittance)
 }

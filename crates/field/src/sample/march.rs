@@ -45,11 +45,18 @@ impl March<'_> {
         ray.near + (offset - 0.5) * self.steps.at(ray.near)
     }
 
-    /// Appends the middles and lengths of up to `most` steps in occupied cells, starting at distance `t`. Returns the distance at which
-    /// to continue, at or beyond the ray's end when done.
-    pub fn advance(&self, ray: &Ray, mut t: f32, most: usize, middles: &mut Vec<f32>, lengths: &mut Vec<f32>) -> f32 {
+    /// Appends the middles and lengths of up to `max_steps` steps in occupied cells, starting at distance `t`. Returns the distance at
+    /// which to continue, at or beyond the ray's end when done.
+    pub fn advance(
+        &self,
+        ray: &Ray,
+        mut t: f32,
+        max_steps: usize,
+        middles: &mut Vec<f32>,
+        lengths: &mut Vec<f32>,
+    ) -> f32 {
         let straight = !matches!(self.space.outside, Outside::Contracted);
-        let full = middles.len().saturating_add(most);
+        let full = middles.len().saturating_add(max_steps);
         let unit = if straight { 0.5 } else { 0.25 };
         let inverse = ray.direction.map(|d| 1.0 / (d * unit));
         while t < ray.far && middles.len() < full {

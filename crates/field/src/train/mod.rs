@@ -97,11 +97,11 @@ pub(crate) struct Scratch {
 }
 
 /// One in this many empty cells is updated.
-pub(crate) const EMPTY_ONE_IN: u32 = 16;
+pub(crate) const EMPTY_CELL_DIVISOR: u32 = 16;
 /// Bounds of the number of rays in a batch.
-const RAYS: [usize; 2] = [64, 16_384];
+const RAY_BOUNDS: [usize; 2] = [64, 16_384];
 /// One in this many rays passes through a pixel of known depth if the depth loss is on.
-const KNOWN_ONE_IN: usize = 4;
+const KNOWN_DEPTH_DIVISOR: usize = 4;
 
 /// One step on photographs: samples [`FieldState::rays`] rays, trains on them, updates the occupancy grid, and sets the number of
 /// rays of the next batch to yield about `options.samples` samples.
@@ -110,7 +110,7 @@ pub fn train_views(state: &mut FieldState, views: &[TrainView], options: &StepOp
     let loss = train_step(state, &batch, options);
     state.scratch.batch = batch;
     if updates_occupancy(&loss, options) {
-        update_occupancy(state, false, EMPTY_ONE_IN, options.seed);
+        update_occupancy(state, false, EMPTY_CELL_DIVISOR, options.seed);
     }
     set_rays(state, &loss, options);
     loss
@@ -123,7 +123,7 @@ pub(crate) fn draw(state: &mut FieldState, views: &[TrainView], options: &StepOp
     let what = Draw {
         rays: state.rays,
         known: if options.depth > 0.0 {
-            state.rays / KNOWN_ONE_IN
+            state.rays / KNOWN_DEPTH_DIVISOR
         } else {
             0
         },
@@ -140,7 +140,7 @@ pub(crate) fn updates_occupancy(loss: &StepLoss, options: &StepOptions) -> bool 
 /// Sets the number of rays of the next batch.
 pub(crate) fn set_rays(state: &mut FieldState, loss: &StepLoss, options: &StepOptions) {
     let wanted = options.samples as f64 * loss.rays as f64 / loss.samples.max(1) as f64;
-    state.rays = ((0.8 * state.rays as f64 + 0.2 * wanted) as usize).clamp(RAYS[0], RAYS[1]);
+    state.rays = ((0.8 * state.rays as f64 + 0.2 * wanted) as usize).clamp(RAY_BOUNDS[0], RAY_BOUNDS[1]);
 }
 
 /// Takes one step on `batch`.

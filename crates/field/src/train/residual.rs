@@ -13,7 +13,7 @@ use irradia_compute::Level;
 use rayon::prelude::*;
 
 /// Points per block, which stays in the cache.
-const CHUNK: usize = 512;
+const POINTS_PER_BLOCK: usize = 512;
 
 /// A point and direction at which to evaluate a residual field.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -59,7 +59,7 @@ pub fn train_residual(
         let n = reached.len();
         workers.par_iter_mut().enumerate().for_each(|(group, worker)| {
             worker.clear(field);
-            for chunk in reached[n * group / GROUPS..n * (group + 1) / GROUPS].chunks(CHUNK) {
+            for chunk in reached[n * group / GROUPS..n * (group + 1) / GROUPS].chunks(POINTS_PER_BLOCK) {
                 for (image, factor) in images {
                     let point = |i: &usize| (units[*i], queries[*i].direction, v_added[*i].map(|v| v * factor));
                     worker.points(level, field, &transposed, *image, chunk.iter().map(point));

@@ -187,10 +187,13 @@ impl Worker {
         }
         for r in 0..range.len() {
             let samples = pass.of(r);
-            let (through, weights) = (&pass.through[samples.clone()], &pass.weights[samples.clone()]);
+            let (interval_transmittances, weights) = (
+                &pass.interval_transmittances[samples.clone()],
+                &pass.weights[samples.clone()],
+            );
             let counted = samples.len();
             let v = &mut self.v_optical_depth[samples.clone()];
-            weights_vjp(through, weights, &v_weights[samples], counted, v);
+            weights_vjp(interval_transmittances, weights, &v_weights[samples], counted, v);
         }
         pass.block.v_density.resize(padded, 0.0);
         let lengths = pass.lengths.iter().chain(std::iter::repeat(&0.0));

@@ -1,7 +1,7 @@
 //! From declarations to a dataset: reads image headers, skips unusable views, adapts cameras to the actual image sizes,
 //! undistorts them or cuts them into faces, and downscales them.
 
-use super::declared::{Declared, DeclaredView};
+use super::declared::{DeclaredDataset, DeclaredView};
 use super::panoramas;
 use super::readout;
 use super::split;
@@ -9,12 +9,12 @@ use super::visible::find_points_seen;
 use super::world::world_from_dataset;
 use super::{DEFAULT_MAX_SIDE, DatasetOptions, Lenses};
 use crate::FormatError;
-use crate::faces::{Cut, image_circle};
+use crate::faces::{PinholeImages, image_circle};
 use crate::image_file::{Header, read_header};
 use crate::map_file::MapFile;
 use crate::photo::PhotoFile;
-use crate::shown::Shown;
 use crate::undistort::Undistortion;
+use crate::valid_region::ValidRegion;
 use glam::DQuat;
 use image::metadata::Orientation;
 use irradia_scene::{Camera, Dataset, Intrinsics, Lens, PointCloud, RollingShutter, Similarity, View};
@@ -26,7 +26,7 @@ use std::sync::Arc;
 /// Minimum number of views of a scene.
 const MIN_VIEWS: usize = 3;
 /// Minimum ratio between the aspect ratios of a photograph and its camera for them to count as different; small copies are rounded.
-const STRETCHED: f64 = 1.03;
+const ASPECT_RATIO_TOLERANCE: f64 = 1.03;
 /// Maximum number of names in a warning.
 const MAX_NAMES: usize = 20;
 /// Number of photographs of a camera in which its image circle is searched.
@@ -34,17 +34,17 @@ const CIRCLE_SAMPLES: usize = 4;
 
 /// Why a view was skipped; each reason is one warning.
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum Skipped {
+enum SkipReason {
     MissingImage,
     UnreadableImage,
     NoPose,
     NoCamera,
 }
 
-impl Skipped {
+impl SkipReason {
     const ALL: [Self; 4] = [Self::MissingImage, Self::UnreadableImage, Self::NoPose, Self::NoCamera];
 
-    fn because(self) -> &'static str {
+    fn description(self) -> &'static str {
         match self {
             Self::MissingImage => "have no image file (--images names the folder of the photographs)",
             Self::UnreadableImage => "have an image file that cannot be read",
@@ -55,24 +55,24 @@ impl Skipped {
 }
 
 /// A view with a readable image file.
-struct Probed {
+struct ProbedView {
     orientation: Orientation,
     jpeg: bool,
     /// At the actual size of the upright image, lens included.
     source: Intrinsics,
-    /// Set for distorted cameras by [`plan_cuts`], unless photographs are kept as they are.
-    cut: Option<Cut>,
+    /// Set for distorted cameras by [`plan_pinhole_images`], unless photographs are kept as they are.
+    pinholes: Option<PinholeImages>,
     /// The usable part of a photograph that is kept as it is; `None` if all of it is usable.
-    shown: Option<Shown>,
+    valid_region: Option<ValidRegion>,
 }
 
-impl Probed {
+impl ProbedView {
     /// The undistorted camera of the photograph at its actual size, or that of its largest face.
     fn undistorted(&self) -> Intrinsics {
-        match &self.cut {
+        match &self.pinholes {
             None => self.source,
-            Some(Cut::Whole(plan)) => plan.pinhole(),
-            Some(Cut::Faces(faces)) => {
+            Some(PinholeImages::Single(plan)) => plan.pinhole(),
+            Some(PinholeImages::Faces(faces)) => {
                 let cameras = faces.iter().map(|(_, plan)| plan.pinhole());
                 let largest = cameras.max_by_key(|k| u64::from(k.width) * u64::from(k.height));
                 largest.expect("a cut has faces")
@@ -81,12 +81,12 @@ impl Probed {
     }
 
     fn is_cut_into_faces(&self) -> bool {
-        matches!(self.cut, Some(Cut::Faces(_)))
+        matches!(self.pinholes, Some(PinholeImages::Faces(_)))
     }
 }
 
-pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<Dataset, FormatError> {
-    let Declared {
+pub(super) fn assemble(declared: DeclaredDataset, options: &DatasetOptions) -> Result<Dataset, FormatError> {
+    let DeclaredDataset {
         kind,
         root,
         mut views,
@@ -96,33 +96,34 @@ pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<D
         mut warnings,
     } = declared;
     if options.lenses != Lenses::Undistorted {
-        views = panoramas::join(views, &root);
+        views = panoramas::merge_faces(views, &root);
     }
     views.sort_by(|a, b| a.name.cmp(&b.name));
     let declared = views.len();
-    views = without_repeated(views);
-    let named = views.len();
-    if named < declared {
+    views = without_duplicates(views);
+    let unique = views.len();
+    if unique < declared {
         warnings.push(format!(
             "{} of {declared} views are left out: other views use the same photographs",
-            declared - named
+            declared - unique
         ));
     }
     if let Some(readout) = &options.readout {
-        let moving = readout::of_neighbours(&mut views, readout);
-        if moving < named {
+        let moving = readout::estimate_shutters(&mut views, readout);
+        if moving < unique {
             warnings.push(format!(
-                "{} of {named} photographs are taken as if exposed at once: their names have no frame numbers, no neighbour has a pose, or \
+                "{} of {unique} photographs are taken as if exposed at once: their names have no frame numbers, no neighbour has a pose, or \
                  they would rotate by more than half a radian",
-                named - moving
+                unique - moving
             ));
         }
     }
 
-    let mut probed: Vec<Result<Probed, Skipped>> = views.par_iter().map(|view| probe(view, ignores_exif)).collect();
-    plan_cuts(&views, &mut probed, options.lenses);
+    let mut probed: Vec<Result<ProbedView, SkipReason>> =
+        views.par_iter().map(|view| probe(view, ignores_exif)).collect();
+    plan_pinhole_images(&views, &mut probed, options.lenses);
     let reasons = skipped_warnings(&views, &probed);
-    let usable: Vec<(DeclaredView, Probed)> = views
+    let usable: Vec<(DeclaredView, ProbedView)> = views
         .into_iter()
         .zip(probed)
         .filter_map(|(view, probed)| Some((view, probed.ok()?)))
@@ -131,7 +132,7 @@ pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<D
         return Err(FormatError::TooFewViews {
             path: root,
             usable: usable.len(),
-            declared: named,
+            declared: unique,
             reasons: reasons.iter().map(|reason| format!("; {reason}")).collect(),
         });
     }
@@ -147,10 +148,10 @@ pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<D
     }
     warnings.extend(reasons);
     warnings.extend(indices.warning);
-    warnings.extend(stretched_warning(&usable));
+    warnings.extend(aspect_ratio_warning(&usable));
     let max_side = options.max_side;
     if max_side == Some(DEFAULT_MAX_SIDE) {
-        warnings.extend(scaled_warning(&usable));
+        warnings.extend(downscale_warning(&usable));
     }
 
     let positions: Vec<_> = usable
@@ -162,7 +163,7 @@ pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<D
         .map(|points| points.in_world(&world))
         .filter(|points| !points.is_empty());
     warnings.extend(faces_warning(&usable));
-    let finishing = Finishing {
+    let builder = ViewBuilder {
         downscale,
         max_side,
         world_from_dataset: &world,
@@ -174,7 +175,7 @@ pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<D
     let mut views_of = Vec::with_capacity(usable.len());
     for (view, probed) in usable {
         let first = views.len();
-        views.extend(finishing.views(view, &probed));
+        views.extend(builder.views(view, &probed));
         views_of.push(first..views.len());
     }
     find_points_seen(&mut views, points.as_ref());
@@ -192,11 +193,11 @@ pub(super) fn assemble(declared: Declared, options: &DatasetOptions) -> Result<D
 
 /// One view of each photograph: the first whose name fits the photograph's path best. Otherwise a copy of a held-out view might be
 /// trained on.
-fn without_repeated(views: Vec<DeclaredView>) -> Vec<DeclaredView> {
+fn without_duplicates(views: Vec<DeclaredView>) -> Vec<DeclaredView> {
     let mut view_of: HashMap<&Path, usize> = HashMap::new();
     for (i, view) in views.iter().enumerate() {
         let Some(image) = view.image.as_deref() else { continue };
-        let fit = |view: &DeclaredView| (image.ends_with(&view.name), image.ends_with(view.name_below()));
+        let fit = |view: &DeclaredView| (image.ends_with(&view.name), image.ends_with(view.name_without_folder()));
         let kept = view_of.entry(image).or_insert(i);
         if fit(view) > fit(&views[*kept]) {
             *kept = i;
@@ -210,37 +211,37 @@ fn without_repeated(views: Vec<DeclaredView>) -> Vec<DeclaredView> {
         .collect()
 }
 
-fn probe(view: &DeclaredView, ignores_exif: bool) -> Result<Probed, Skipped> {
-    let image = view.image.as_deref().ok_or(Skipped::MissingImage)?;
+fn probe(view: &DeclaredView, ignores_exif: bool) -> Result<ProbedView, SkipReason> {
+    let image = view.image.as_deref().ok_or(SkipReason::MissingImage)?;
     if view.pose.is_none() {
-        return Err(Skipped::NoPose);
+        return Err(SkipReason::NoPose);
     }
-    let header = read_header(image).map_err(|_| Skipped::UnreadableImage)?;
+    let header = read_header(image).map_err(|_| SkipReason::UnreadableImage)?;
     let orientation = orientation_to_apply(&header, view.camera.size, ignores_exif);
     let (width, height) = oriented_size(&header, orientation);
     let source = view.camera.at_size(width, height);
     if !source.is_valid() || !source.lens.is_finite() {
-        return Err(Skipped::NoCamera);
+        return Err(SkipReason::NoCamera);
     }
-    Ok(Probed {
+    Ok(ProbedView {
         orientation,
         jpeg: header.jpeg,
         source,
-        cut: None,
-        shown: None,
+        pinholes: None,
+        valid_region: None,
     })
 }
 
 /// Plans once for every distinct distorted camera, for all views that share it, its pinhole images, or the usable part of photographs
 /// that are kept as they are.
-fn plan_cuts(views: &[DeclaredView], probed: &mut [Result<Probed, Skipped>], lenses: Lenses) {
+fn plan_pinhole_images(views: &[DeclaredView], probed: &mut [Result<ProbedView, SkipReason>], lenses: Lenses) {
     let mut distinct: Vec<Intrinsics> = Vec::new();
     for view in probed.iter().flatten() {
         if view.source.lens != Lens::Pinhole && !distinct.contains(&view.source) {
             distinct.push(view.source);
         }
     }
-    let circle = |source: &Intrinsics| {
+    let find_circle = |source: &Intrinsics| {
         let mut photographs: Vec<(&Path, Orientation)> = Vec::new();
         for (view, probed) in views.iter().zip(probed.iter()) {
             if let (Some(image), Ok(probed)) = (&view.image, probed)
@@ -249,32 +250,32 @@ fn plan_cuts(views: &[DeclaredView], probed: &mut [Result<Probed, Skipped>], len
                 photographs.push((image, probed.orientation));
             }
         }
-        let every = photographs.len().div_ceil(CIRCLE_SAMPLES).max(1);
+        let stride = photographs.len().div_ceil(CIRCLE_SAMPLES).max(1);
         // A photograph that cannot be decoded is reported where it is loaded.
-        image_circle(source, photographs.into_iter().step_by(every))
+        image_circle(source, photographs.into_iter().step_by(stride))
             .ok()
             .flatten()
     };
     let plans: Vec<Plan> = distinct
         .par_iter()
         .map(|source| {
-            let stays = || Plan::Stays(Shown::of(source, || circle(source)));
+            let keep_distorted = || Plan::KeepDistorted(ValidRegion::of(source, || find_circle(source)));
             if lenses == Lenses::Distorted {
-                return stays();
+                return keep_distorted();
             }
-            match Cut::plan(source, || circle(source)) {
-                Some(Cut::Faces(_)) if lenses == Lenses::Whole => stays(),
-                cut => cut.map_or(Plan::Impossible, Plan::Cut),
+            match PinholeImages::plan(source, || find_circle(source)) {
+                Some(PinholeImages::Faces(_)) if lenses == Lenses::Whole => keep_distorted(),
+                pinholes => pinholes.map_or(Plan::Impossible, Plan::Undistort),
             }
         })
         .collect();
     for view in probed {
-        let Ok(known) = view else { continue };
-        if let Some(camera) = distinct.iter().position(|source| *source == known.source) {
+        let Ok(usable) = view else { continue };
+        if let Some(camera) = distinct.iter().position(|source| *source == usable.source) {
             match &plans[camera] {
-                Plan::Cut(cut) => known.cut = Some(cut.clone()),
-                Plan::Stays(shown) => known.shown = *shown,
-                Plan::Impossible => *view = Err(Skipped::NoCamera),
+                Plan::Undistort(pinholes) => usable.pinholes = Some(pinholes.clone()),
+                Plan::KeepDistorted(valid_region) => usable.valid_region = *valid_region,
+                Plan::Impossible => *view = Err(SkipReason::NoCamera),
             }
         }
     }
@@ -282,8 +283,8 @@ fn plan_cuts(views: &[DeclaredView], probed: &mut [Result<Probed, Skipped>], len
 
 /// How the photographs of a distorted camera are used.
 enum Plan {
-    Cut(Cut),
-    Stays(Option<Shown>),
+    Undistort(PinholeImages),
+    KeepDistorted(Option<ValidRegion>),
     /// The lens leaves no image.
     Impossible,
 }
@@ -295,25 +296,25 @@ fn usable_bounds([near, far]: [f64; 2]) -> Option<[f32; 2]> {
 }
 
 /// The warning about photographs whose aspect ratio is not their camera's; its focal lengths are stretched with the image.
-fn stretched_warning(usable: &[(DeclaredView, Probed)]) -> Option<String> {
-    let is_stretched = |(view, probed): &&(DeclaredView, Probed)| {
+fn aspect_ratio_warning(usable: &[(DeclaredView, ProbedView)]) -> Option<String> {
+    let is_mismatched = |(view, probed): &&(DeclaredView, ProbedView)| {
         let (width, height) = (f64::from(probed.source.width), f64::from(probed.source.height));
         let declared = view.camera.size.map_or(1.0, |[w, h]| w * height / (h * width));
-        !(1.0 / STRETCHED..=STRETCHED).contains(&declared)
+        !(1.0 / ASPECT_RATIO_TOLERANCE..=ASPECT_RATIO_TOLERANCE).contains(&declared)
     };
-    let mut stretched = usable.iter().filter(is_stretched);
-    let (view, probed) = stretched.next()?;
+    let mut mismatched = usable.iter().filter(is_mismatched);
+    let (view, probed) = mismatched.next()?;
     let [width, height] = view.camera.size?;
-    let (count, of) = (1 + stretched.count(), usable.len());
+    let (count, total) = (1 + mismatched.count(), usable.len());
     Some(format!(
-        "{count} of {of} photographs do not have the aspect ratio of their cameras, such as {}, of {}x{} pixels for {width}x{height}: they \
+        "{count} of {total} photographs do not have the aspect ratio of their cameras, such as {}, of {}x{} pixels for {width}x{height}: they \
          were cropped or rotated, or width and height are exchanged; poses will not fit unless they were stretched",
         view.name, probed.source.width, probed.source.height
     ))
 }
 
 /// The warning about photographs downscaled by default.
-fn scaled_warning(usable: &[(DeclaredView, Probed)]) -> Option<String> {
+fn downscale_warning(usable: &[(DeclaredView, ProbedView)]) -> Option<String> {
     let sizes = usable.iter().map(|(_, probed)| probed.undistorted());
     let large: Vec<Intrinsics> = sizes.filter(|k| k.width.max(k.height) > DEFAULT_MAX_SIDE).collect();
     let largest = large.iter().max_by_key(|k| u64::from(k.width) * u64::from(k.height))?;
@@ -328,7 +329,7 @@ fn scaled_warning(usable: &[(DeclaredView, Probed)]) -> Option<String> {
 }
 
 /// The warning about photographs that are cut into faces.
-fn faces_warning(usable: &[(DeclaredView, Probed)]) -> Option<String> {
+fn faces_warning(usable: &[(DeclaredView, ProbedView)]) -> Option<String> {
     let cut = usable.iter().filter(|(_, probed)| probed.is_cut_into_faces()).count();
     (cut > 0).then(|| {
         format!(
@@ -340,7 +341,7 @@ fn faces_warning(usable: &[(DeclaredView, Probed)]) -> Option<String> {
 }
 
 /// What is needed to turn declared views into views.
-struct Finishing<'a> {
+struct ViewBuilder<'a> {
     downscale: f32,
     max_side: Option<u32>,
     world_from_dataset: &'a Similarity,
@@ -349,13 +350,13 @@ struct Finishing<'a> {
     keeps_alpha: bool,
 }
 
-impl Finishing<'_> {
+impl ViewBuilder<'_> {
     /// The view of a photograph, or one for each of its faces.
-    fn views(&self, view: DeclaredView, probed: &Probed) -> Vec<View> {
-        match &probed.cut {
+    fn views(&self, view: DeclaredView, probed: &ProbedView) -> Vec<View> {
+        match &probed.pinholes {
             None => self.view(&view, probed, None).into_iter().collect(),
-            Some(Cut::Whole(plan)) => self.view(&view, probed, Some(**plan)).into_iter().collect(),
-            Some(Cut::Faces(faces)) => faces
+            Some(PinholeImages::Single(plan)) => self.view(&view, probed, Some(**plan)).into_iter().collect(),
+            Some(PinholeImages::Faces(faces)) => faces
                 .iter()
                 .filter_map(|(name, plan)| {
                     let mut face = self.view(&view, probed, Some(*plan))?;
@@ -378,21 +379,21 @@ impl Finishing<'_> {
     }
 
     /// The view of a photograph undistorted by `plan`.
-    fn view(&self, view: &DeclaredView, probed: &Probed, plan: Option<Undistortion>) -> Option<View> {
+    fn view(&self, view: &DeclaredView, probed: &ProbedView, plan: Option<Undistortion>) -> Option<View> {
         let undistorted = plan.map_or(probed.source, |plan| plan.pinhole());
-        let longer = undistorted.width.max(undistorted.height) as f32;
-        let smaller = self
+        let longer_side = undistorted.width.max(undistorted.height) as f32;
+        let downscale = self
             .max_side
-            .map_or(self.downscale, |side| self.downscale.max(longer / side as f32));
-        let intrinsics = undistorted.scaled(1.0 / smaller);
+            .map_or(self.downscale, |side| self.downscale.max(longer_side / side as f32));
+        let intrinsics = undistorted.scaled(1.0 / downscale);
         let photo = PhotoFile {
             image: view.image.clone()?,
             mask: view.mask.clone(),
             orientation: probed.orientation,
             jpeg: probed.jpeg,
-            upright: (probed.source.width, probed.source.height),
+            upright_size: (probed.source.width, probed.source.height),
             undistortion: plan,
-            shown: probed.shown,
+            valid_region: probed.valid_region,
             size: (intrinsics.width, intrinsics.height),
             keeps_alpha: self.keeps_alpha,
         };
@@ -402,13 +403,13 @@ impl Finishing<'_> {
                 Arc::new(MapFile {
                     path,
                     orientation: probed.orientation,
-                    upright: (probed.source.width, probed.source.height),
+                    upright_size: (probed.source.width, probed.source.height),
                     undistortion: plan,
                 })
             })
         };
         let mut pose = view.pose?;
-        pose.rotation *= plan.map_or(DQuat::IDENTITY, |plan| plan.turn());
+        pose.rotation *= plan.map_or(DQuat::IDENTITY, |plan| plan.rotation());
         let camera = Camera::new(pose.in_world(self.world_from_dataset), intrinsics);
         let shutter = view.shutter.map(|shutter| RollingShutter {
             translation: shutter.translation * self.world_from_dataset.scale as f32,
@@ -435,11 +436,11 @@ fn orientation_to_apply(header: &Header, declared: Option<[f64; 2]>, ignores_exi
     let stored = (header.width, header.height);
     // Aspects, not sizes: the images may be smaller copies of those from which the poses were made.
     let mismatch = |(w, h): (u32, u32), [dw, dh]: [f64; 2]| (f64::from(w) / f64::from(h)).ln() - (dw / dh).ln();
-    let turn = match declared {
+    let apply_exif = match declared {
         Some(size) if upright != stored => mismatch(upright, size).abs() <= mismatch(stored, size).abs(),
         _ => !ignores_exif,
     };
-    if turn {
+    if apply_exif {
         header.orientation
     } else {
         Orientation::NoTransforms
@@ -456,7 +457,7 @@ pub(crate) fn oriented_size(header: &Header, orientation: Orientation) -> (u32, 
 
 /// The orientation that [`super::read_dataset`] applies to a photograph of a COLMAP model whose camera has the upright size, and the up
 /// direction in the resulting image, `[right, down]`, if that is not its top. Half turns and square images stay as stored.
-pub(crate) fn turned_as_stored(header: &Header) -> (Orientation, Option<[i8; 2]>) {
+pub(crate) fn colmap_orientation(header: &Header) -> (Orientation, Option<[i8; 2]>) {
     use Orientation::{FlipVertical, Rotate90, Rotate90FlipH, Rotate180, Rotate270, Rotate270FlipH};
     let (width, height) = oriented_size(header, header.orientation);
     let applied = orientation_to_apply(header, Some([f64::from(width), f64::from(height)]), true);
@@ -471,8 +472,8 @@ pub(crate) fn turned_as_stored(header: &Header) -> (Orientation, Option<[i8; 2]>
 }
 
 /// One line per reason, with the count and the first names.
-fn skipped_warnings(views: &[DeclaredView], probed: &[Result<Probed, Skipped>]) -> Vec<String> {
-    let line = |reason: Skipped| {
+fn skipped_warnings(views: &[DeclaredView], probed: &[Result<ProbedView, SkipReason>]) -> Vec<String> {
+    let line = |reason: SkipReason| {
         let pairs = views.iter().zip(probed);
         let names: Vec<&str> = pairs
             .filter(|(_, p)| p.as_ref().err() == Some(&reason))
@@ -488,11 +489,11 @@ fn skipped_warnings(views: &[DeclaredView], probed: &[Result<Probed, Skipped>]) 
                 "{} of {} views {} and are skipped: {listed}{more}",
                 names.len(),
                 views.len(),
-                reason.because()
+                reason.description()
             )
         })
     };
-    Skipped::ALL.into_iter().filter_map(line).collect()
+    SkipReason::ALL.into_iter().filter_map(line).collect()
 }
 
 #[cfg(test)]
@@ -507,7 +508,7 @@ mod tests {
                 image: image.map(PathBuf::from),
                 ..DeclaredView::posed(Path::new(""), name, None, None, DeclaredCamera::panorama())
             };
-            let views = without_repeated(declared.iter().map(view).collect());
+            let views = without_duplicates(declared.iter().map(view).collect());
             views.into_iter().map(|view| view.name).collect::<Vec<_>>()
         };
         let rig = [

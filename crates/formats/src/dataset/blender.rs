@@ -1,6 +1,6 @@
 //! Folders with one transforms file per split, like NeRF's synthetic scenes (Mildenhall et al. 2020).
 
-use super::declared::{Declared, Split};
+use super::declared::{DeclaredDataset, Split};
 use super::nerfstudio::declared_views;
 use super::transforms::parse_transforms;
 use crate::FormatError;
@@ -10,7 +10,7 @@ use std::path::Path;
 
 /// Training views are those of the train file; held out are the frames of the test file, or of the validation file if there
 /// is no test file.
-pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError> {
+pub(super) fn read(root: &Path, downscale: f32) -> Result<DeclaredDataset, FormatError> {
     let train = "transforms_train.json";
     let held_out = ["transforms_test.json", "transforms_val.json"]
         .into_iter()
@@ -36,7 +36,7 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
         // Then the rule for datasets without a split applies.
         views.iter_mut().for_each(|view| view.split = None);
     }
-    Ok(Declared {
+    Ok(DeclaredDataset {
         kind: "Blender",
         root: root.to_owned(),
         views,

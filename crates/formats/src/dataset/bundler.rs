@@ -1,10 +1,10 @@
 //! Bundler's `bundle.out`, version 0.3 (<https://www.cs.cornell.edu/~snavely/bundler/bundler-v0.4-manual.html>, S6). Poses are
 //! camera-from-world with x right, y up and z backward; pixels are counted from the image's centre.
 
-use super::declared::{Declared, DeclaredCamera, DeclaredPose, DeclaredView, Focal, lens_or_pinhole};
+use super::declared::{DeclaredCamera, DeclaredDataset, DeclaredPose, DeclaredView, Focal, lens_or_pinhole};
 use super::files::{first_file, locate_image};
 use super::tokens::{Tokens, text};
-use super::tracks::{TrackPoint, declared, track_point};
+use super::tracks::{TrackPoint, declared_points, parse_track_point};
 use crate::error::read_and_parse;
 use crate::{FormatError, Malformed};
 use glam::{DMat3, DVec3};
@@ -12,9 +12,9 @@ use irradia_scene::Lens;
 use std::path::{Path, PathBuf};
 
 /// Names of the list of photographs, beside the bundle or in the folder above.
-const LISTS: [&str; 4] = ["list.txt", "bundle.out.list.txt", "bundle.list.txt", "image_list.txt"];
+const LIST_NAMES: [&str; 4] = ["list.txt", "bundle.out.list.txt", "bundle.list.txt", "image_list.txt"];
 /// Where the photographs are, relative to the list.
-const FOLDERS: [&str; 3] = ["", "images", "../images"];
+const IMAGE_FOLDERS: [&str; 3] = ["", "images", "../images"];
 
 /// A file of cameras and points.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -39,16 +39,16 @@ pub struct BundleCamera {
 }
 
 pub(super) fn find(path: &Path) -> Option<PathBuf> {
-    let is_bundle = |file: &Path| file.extension().is_some_and(|e| e == "out") && begins_as_a_bundle(file);
+    let is_bundle = |file: &Path| file.extension().is_some_and(|e| e == "out") && is_bundle_file(file);
     first_file(path, is_bundle).or_else(|| first_file(&path.join("bundle"), is_bundle))
 }
 
-fn begins_as_a_bundle(file: &Path) -> bool {
-    super::files::begins_with(file, |start| start.starts_with(b"# Bundle file"))
+fn is_bundle_file(file: &Path) -> bool {
+    super::files::start_matches(file, |start| start.starts_with(b"# Bundle file"))
 }
 
 /// The name in a line of a list, which may have a focal length and other numbers after it.
-fn name_in(line: &str) -> &str {
+fn name_in_list_line(line: &str) -> &str {
     let mut name = line.trim();
     while let Some((before, last)) = name.rsplit_once(char::is_whitespace)
         && last.parse::<f64>().is_ok()
@@ -58,25 +58,28 @@ fn name_in(line: &str) -> &str {
     name
 }
 
-pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError> {
+pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, FormatError> {
     let file = find(path).ok_or_else(|| FormatError::malformed(path, "contains no bundle.out"))?;
     let bundle = read_and_parse(&file, parse_bundle)?;
-    let beside = file.parent().unwrap_or(Path::new("."));
-    let folders = [Some(beside), beside.parent()];
+    let parent = file.parent().unwrap_or(Path::new("."));
+    let folders = [Some(parent), parent.parent()];
     let list = folders
         .into_iter()
         .flatten()
-        .flat_map(|folder| LISTS.map(|name| folder.join(name)))
+        .flat_map(|folder| LIST_NAMES.map(|name| folder.join(name)))
         .find(|list| list.is_file());
     let Some(list) = list else {
         let message = format!(
             "it names no photographs, and there is no {} beside it",
-            LISTS.join(" or ")
+            LIST_NAMES.join(" or ")
         );
         return Err(FormatError::malformed(&file, message));
     };
     let names = read_and_parse(&list, |bytes| {
-        let names = text(bytes)?.lines().map(name_in).filter(|name| !name.is_empty());
+        let names = text(bytes)?
+            .lines()
+            .map(name_in_list_line)
+            .filter(|name| !name.is_empty());
         Ok(names.map(str::to_owned).collect::<Vec<String>>())
     })?;
     if names.len() != bundle.cameras.len() {
@@ -85,19 +88,19 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
         return Err(FormatError::malformed(&list, message));
     }
     let root = list.parent().unwrap_or(Path::new(".")).to_owned();
-    let (points, seen) = declared(&bundle.points, names.len());
+    let (points, points_seen) = declared_points(&bundle.points, names.len());
     let mut views = Vec::with_capacity(names.len());
     // A focal length of 0 says that the photograph has no pose.
-    let all = names.iter().zip(&bundle.cameras).zip(seen);
-    for ((name, camera), points_seen) in all.filter(|((_, camera), _)| camera.focal != 0.0) {
+    let entries = names.iter().zip(&bundle.cameras).zip(points_seen);
+    for ((name, camera), points_seen) in entries.filter(|((_, camera), _)| camera.focal != 0.0) {
         let name = name.replace('\\', "/");
-        let image = locate_image(&root, &FOLDERS, &name);
+        let image = locate_image(&root, &IMAGE_FOLDERS, &name);
         views.push(DeclaredView {
             points_seen,
             ..DeclaredView::posed(&root, &name, image, pose(camera), declared_camera(camera))
         });
     }
-    Ok(Declared {
+    Ok(DeclaredDataset {
         kind: "Bundler",
         root,
         views,
@@ -130,7 +133,7 @@ pub fn parse_bundle(bytes: &[u8]) -> Result<Bundle, Malformed> {
         });
     }
     for _ in 0..points {
-        bundle.points.push(track_point(&mut tokens)?);
+        bundle.points.push(parse_track_point(&mut tokens)?);
     }
     Ok(bundle)
 }

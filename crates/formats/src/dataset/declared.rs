@@ -6,7 +6,7 @@ use irradia_scene::{Intrinsics, Lens, PointCloud, Pose, RollingShutter, Similari
 use std::f64::consts::{PI, TAU};
 use std::path::{Path, PathBuf};
 
-pub(super) struct Declared {
+pub(super) struct DeclaredDataset {
     /// Display name: `COLMAP (binary)`.
     pub kind: &'static str,
     /// The dataset's folder.
@@ -72,7 +72,7 @@ impl DeclaredView {
     }
 
     /// Its name below the folder of the photographs: `a/b.jpg` of `images/a/b.jpg`.
-    pub fn name_below(&self) -> &str {
+    pub fn name_without_folder(&self) -> &str {
         self.name.split_once('/').map_or(&self.name, |(_, below)| below)
     }
 }
@@ -136,7 +136,7 @@ pub(super) enum Split {
     Train,
     Test,
     /// In neither list.
-    Left,
+    Unlisted,
 }
 
 /// Intrinsics as declared: size and principal point may be taken from the image file.
@@ -173,8 +173,8 @@ impl DeclaredCamera {
 
     /// The camera of an image file of `width` x `height` pixels.
     pub fn at_size(&self, width: u32, height: u32) -> Intrinsics {
-        let real = [f64::from(width), f64::from(height)];
-        let declared = self.size.unwrap_or(real);
+        let actual = [f64::from(width), f64::from(height)];
+        let declared = self.size.unwrap_or(actual);
         let from_angle = |side: usize, angle: f64| 0.5 * declared[side] / (0.5 * angle).tan();
         let focal = match self.focal {
             Focal::Pixels(focal) => focal,
@@ -184,7 +184,7 @@ impl DeclaredCamera {
             Focal::Angles([None, y]) => [from_angle(1, y.unwrap_or(f64::NAN)); 2],
         };
         let center = self.center.unwrap_or([0.5 * declared[0], 0.5 * declared[1]]);
-        let scale = [real[0] / declared[0], real[1] / declared[1]];
+        let scale = [actual[0] / declared[0], actual[1] / declared[1]];
         Intrinsics {
             width,
             height,
@@ -199,14 +199,14 @@ impl DeclaredCamera {
 
 /// A distortion model whose coefficients are all zero is a pinhole.
 pub(super) fn lens_or_pinhole(lens: Lens) -> Lens {
-    let bends = match lens {
+    let distorts = match lens {
         Lens::Pinhole => false,
         Lens::Opencv { k, p } => k.iter().chain(&p).any(|v| *v != 0.0),
         Lens::Fov { omega } => omega != 0.0,
         // The fisheye model distorts even with zeros.
         Lens::Fisheye { .. } | Lens::Equirectangular => true,
     };
-    if bends { lens } else { Lens::Pinhole }
+    if distorts { lens } else { Lens::Pinhole }
 }
 
 /// A pose from the camera's axes (right, down, forward; any length) and centre in the world; `None` when they are not

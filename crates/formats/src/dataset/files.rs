@@ -4,7 +4,7 @@ use crate::FormatError;
 use std::io::Read;
 use std::path::{Component, Path, PathBuf};
 
-const EXTENSIONS: [&str; 20] = [
+const IMAGE_EXTENSIONS: [&str; 20] = [
     "png", "jpg", "jpeg", "PNG", "JPG", "JPEG", "webp", "tif", "tiff", "WEBP", "TIF", "TIFF", "heic", "heif", "hif",
     "HEIC", "HEIF", "HIF", "exr", "EXR",
 ];
@@ -15,14 +15,14 @@ pub(super) fn find_image(path: &Path) -> Option<PathBuf> {
         return Some(path.to_owned());
     }
     let name = path.file_name()?;
-    let added = EXTENSIONS.iter().map(|extension| {
+    let added = IMAGE_EXTENSIONS.iter().map(|extension| {
         let mut name = name.to_owned();
         name.push(".");
         name.push(extension);
         path.with_file_name(name)
     });
-    let exchanged = EXTENSIONS.iter().map(|extension| path.with_extension(extension));
-    added.chain(exchanged).find(|candidate| candidate.is_file())
+    let replaced = IMAGE_EXTENSIONS.iter().map(|extension| path.with_extension(extension));
+    added.chain(replaced).find(|candidate| candidate.is_file())
 }
 
 /// `path` below `root`, with forward slashes and without `./`.
@@ -38,7 +38,7 @@ pub(super) fn relative_name(root: &Path, path: &Path) -> String {
 /// Whether a file's name is that of an image.
 pub(crate) fn is_image_name(path: &Path) -> bool {
     let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
-    extension.is_some_and(|e| EXTENSIONS.contains(&e.as_str()))
+    extension.is_some_and(|e| IMAGE_EXTENSIONS.contains(&e.as_str()))
 }
 
 /// The images directly in a folder, sorted by name.
@@ -114,18 +114,18 @@ pub(super) fn choose_image_folder(root: &Path, downscale: f32) -> Option<ImageFo
 /// The photograph `name` of a dataset in one of `folders` below `root`: by its path, or by its file name alone.
 pub(super) fn locate_image(root: &Path, folders: &[&str], name: &str) -> Option<PathBuf> {
     let file = Path::new(name).file_name()?;
-    let below = |name: &Path| {
+    let find_in_folders = |name: &Path| {
         folders
             .iter()
             .find_map(|folder| find_image(&root.join(folder).join(name)))
     };
-    below(Path::new(name)).or_else(|| below(Path::new(file)))
+    find_in_folders(Path::new(name)).or_else(|| find_in_folders(Path::new(file)))
 }
 
 /// `path` itself if it is a file of that name, or the file `name` in it.
-pub(super) fn named_or_in(path: &Path, name: &str) -> Option<PathBuf> {
-    let is_it = path.is_file() && path.file_name() == Path::new(name).file_name();
-    let file = if is_it { path.to_owned() } else { path.join(name) };
+pub(super) fn file_named(path: &Path, name: &str) -> Option<PathBuf> {
+    let is_named = path.is_file() && path.file_name() == Path::new(name).file_name();
+    let file = if is_named { path.to_owned() } else { path.join(name) };
     file.is_file().then_some(file)
 }
 
@@ -137,10 +137,10 @@ pub(super) fn first_file(path: &Path, keep: impl Fn(&Path) -> bool) -> Option<Pa
     list_files(path, keep).ok()?.into_iter().next()
 }
 
-/// Whether `accepts` the first bytes of a file.
-pub(super) fn begins_with(file: &Path, accepts: impl Fn(&[u8]) -> bool) -> bool {
-    const START: u64 = 4096;
+/// Whether `predicate` accepts the first bytes of a file.
+pub(super) fn start_matches(file: &Path, predicate: impl Fn(&[u8]) -> bool) -> bool {
+    const MAX_START_BYTES: u64 = 4096;
     let mut start = Vec::new();
-    let read = std::fs::File::open(file).and_then(|file| file.take(START).read_to_end(&mut start));
-    read.is_ok() && accepts(&start)
+    let read = std::fs::File::open(file).and_then(|file| file.take(MAX_START_BYTES).read_to_end(&mut start));
+    read.is_ok() && predicate(&start)
 }

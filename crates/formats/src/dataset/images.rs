@@ -1,6 +1,6 @@
 //! Photographs in a folder that the user names, instead of where the layout expects them.
 
-use super::declared::Declared;
+use super::declared::DeclaredDataset;
 use super::files::find_image;
 use crate::FormatError;
 use std::path::Path;
@@ -10,10 +10,10 @@ use std::path::Path;
 ///
 /// # Errors
 /// When none of them is found.
-pub(super) fn relocate(declared: &mut Declared, folder: &Path, downscale: f32) -> Result<(), FormatError> {
+pub(super) fn relocate(declared: &mut DeclaredDataset, folder: &Path, downscale: f32) -> Result<(), FormatError> {
     for view in &mut declared.views {
         let name = Path::new(&view.name);
-        let below = Path::new(view.name_below());
+        let below = Path::new(view.name_without_folder());
         let candidates = [Some(name), Some(below), name.file_name().map(Path::new)];
         let found = candidates
             .into_iter()

@@ -2,10 +2,10 @@
 //! names. Fifteen are a 3x5 matrix whose columns are the camera's axes *down, right, backwards* in the world, its centre,
 //! and height, width and focal length in pixels of the original images; two are the nearest and farthest depth.
 
-use super::beside::Beside;
-use super::declared::{Declared, DeclaredCamera, DeclaredView, Focal, pose_from_axes};
+use super::declared::{DeclaredCamera, DeclaredDataset, DeclaredView, Focal, pose_from_axes};
 use super::files::{choose_image_folder, list_images, relative_name};
 use super::npy::parse_table;
+use super::sibling_folder::SiblingFolder;
 use crate::error::read_and_parse;
 use crate::{FormatError, Malformed};
 use glam::DVec3;
@@ -55,7 +55,7 @@ pub fn parse_poses_bounds(bytes: &[u8]) -> Result<Vec<LlffPose>, Malformed> {
     Ok(poses.collect())
 }
 
-pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError> {
+pub(super) fn read(root: &Path, downscale: f32) -> Result<DeclaredDataset, FormatError> {
     let file = root.join("poses_bounds.npy");
     let poses = read_and_parse(&file, parse_poses_bounds)?;
     let Some(folder) = choose_image_folder(root, downscale) else {
@@ -77,22 +77,22 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
             ),
         ));
     }
-    let masks = Beside::masks(root, &folder.name);
+    let masks = SiblingFolder::masks(root, &folder.name);
     let views: Vec<DeclaredView> = poses
         .iter()
         .zip(images)
         .map(|(pose, image)| {
             let [height, width, focal] = pose.height_width_focal;
-            let known = height >= 1.0 && width >= 1.0;
+            let has_size = height >= 1.0 && width >= 1.0;
             DeclaredView {
                 name: relative_name(root, &image),
                 mask: masks
                     .as_ref()
-                    .and_then(|masks| masks.of(&relative_name(&root.join(&folder.name), &image))),
+                    .and_then(|masks| masks.file_of(&relative_name(&root.join(&folder.name), &image))),
                 image: Some(image),
                 pose: pose_from_axes(pose.right, pose.down, -pose.backwards, pose.position),
                 camera: DeclaredCamera {
-                    size: known.then_some([width, height]),
+                    size: has_size.then_some([width, height]),
                     focal: Focal::Pixels([focal, focal]),
                     center: None,
                     lens: Lens::Pinhole,
@@ -110,7 +110,7 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
     let mut warnings: Vec<String> = folder.warning.into_iter().collect();
     let masked = views.iter().filter(|view| view.mask.is_some()).count();
     warnings.extend(masks.and_then(|masks| masks.mask_warning(views.len(), masked)));
-    Ok(Declared {
+    Ok(DeclaredDataset {
         kind: "LLFF",
         root: root.to_owned(),
         views,

@@ -1,8 +1,10 @@
 //! Cameras exported by Agisoft Metashape as XML. Poses are world-from-camera with OpenCV axes, row by row, in the coordinates of a
 //! chunk; its transform leads to the world. Lens: the manual's appendix "Camera models", whose P1 and P2 are OpenCV's p2 and p1.
 
-use super::declared::{Declared, DeclaredCamera, DeclaredPose, DeclaredView, Focal, lens_or_pinhole, pose_from_axes};
-use super::files::{begins_with, first_file, locate_image};
+use super::declared::{
+    DeclaredCamera, DeclaredDataset, DeclaredPose, DeclaredView, Focal, lens_or_pinhole, pose_from_axes,
+};
+use super::files::{first_file, locate_image, start_matches};
 use crate::error::read_and_parse;
 use crate::xml::{Element, parse_xml};
 use crate::{FormatError, Malformed};
@@ -12,16 +14,16 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 /// Where the photographs are, relative to the file.
-const FOLDERS: [&str; 3] = ["images", "", "../images"];
+const IMAGE_FOLDERS: [&str; 3] = ["images", "", "../images"];
 
 pub(super) fn find(path: &Path) -> Option<PathBuf> {
     let has_document = |start: &[u8]| start.windows(9).any(|word| word == b"<document");
     first_file(path, |file| {
-        file.extension().is_some_and(|e| e.eq_ignore_ascii_case("xml")) && begins_with(file, has_document)
+        file.extension().is_some_and(|e| e.eq_ignore_ascii_case("xml")) && start_matches(file, has_document)
     })
 }
 
-pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError> {
+pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, FormatError> {
     let file = find(path).ok_or_else(|| FormatError::malformed(path, "contains no Metashape cameras"))?;
     let cameras = read_and_parse(&file, parse_metashape)?;
     let root = file.parent().unwrap_or(Path::new(".")).to_owned();
@@ -32,10 +34,10 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
     }
     let view = |camera: MetashapeCamera| {
         let name = camera.label.replace('\\', "/");
-        let image = locate_image(&root, &FOLDERS, &name);
+        let image = locate_image(&root, &IMAGE_FOLDERS, &name);
         DeclaredView::posed(&root, &name, image, camera.pose, camera.intrinsics)
     };
-    Ok(Declared {
+    Ok(DeclaredDataset {
         kind: "Metashape",
         views: posed.into_iter().map(view).collect(),
         points: None,
@@ -64,7 +66,7 @@ struct Transform {
 /// Parses the XML; every camera of its first chunk.
 pub(crate) fn parse_metashape(bytes: &[u8]) -> Result<Vec<MetashapeCamera>, Malformed> {
     let document = parse_xml(bytes)?;
-    let missing = |what: &str| Malformed(format!("has no <{what}>; export cameras in the format Agisoft XML"));
+    let missing = |tag: &str| Malformed(format!("has no <{tag}>; export cameras in the format Agisoft XML"));
     let chunk = document.child("chunk").ok_or_else(|| missing("chunk"))?;
     let mut sensors = HashMap::new();
     for sensor in chunk.descendants("sensor") {
@@ -117,20 +119,20 @@ pub(crate) fn parse_metashape(bytes: &[u8]) -> Result<Vec<MetashapeCamera>, Malf
 
 /// The adjusted calibration, else the first.
 fn calibration(sensor: &Element) -> Option<&Element> {
-    let all = || sensor.children.iter().filter(|child| child.name == "calibration");
-    all()
+    let calibrations = || sensor.children.iter().filter(|child| child.name == "calibration");
+    calibrations()
         .find(|child| child.attribute("class") == Some("adjusted"))
-        .or_else(|| all().next())
+        .or_else(|| calibrations().next())
 }
 
 fn pose(matrix: &[f64], world: Option<&Transform>) -> Option<DeclaredPose> {
     let column = |c: usize| DVec3::new(matrix[c], matrix[4 + c], matrix[8 + c]);
     let [right, down, forward, mut position] = [0, 1, 2, 3].map(column);
-    let turn = world.map_or(DMat3::IDENTITY, |world| world.rotation);
+    let rotation = world.map_or(DMat3::IDENTITY, |world| world.rotation);
     if let Some(world) = world {
         position = world.scale * (world.rotation * position) + world.translation;
     }
-    pose_from_axes(turn * right, turn * down, turn * forward, position)
+    pose_from_axes(rotation * right, rotation * down, rotation * forward, position)
 }
 
 /// `None` if it is incomplete: the chunk has not been placed in the world yet.
@@ -159,22 +161,27 @@ fn intrinsics(sensor: &Element, calibration: &Element) -> Result<DeclaredCamera,
             .child(name)
             .and_then(|child| child.numbers().first().copied())
     };
-    let of = |name: &str| number(name).unwrap_or(0.0);
+    let coefficient = |name: &str| number(name).unwrap_or(0.0);
     let kind = calibration
         .attribute("type")
         .or_else(|| sensor.attribute("type"))
         .unwrap_or("frame");
     let lens = match kind {
-        "frame" if of("k4") == 0.0 => Lens::Opencv {
-            k: [of("k1"), of("k2"), of("k3"), 0.0, 0.0, 0.0],
-            p: [of("p2"), of("p1")],
+        "frame" if coefficient("k4") == 0.0 => Lens::Opencv {
+            k: [coefficient("k1"), coefficient("k2"), coefficient("k3"), 0.0, 0.0, 0.0],
+            p: [coefficient("p2"), coefficient("p1")],
         },
         "frame" => {
             return Err(Malformed(
                 "a sensor has a k4, which is not supported; optimise the cameras without it, or undistort the photographs".into(),
             ));
         }
-        "fisheye" | "equidistant_fisheye" => Lens::fisheye([of("k1"), of("k2"), of("k3"), of("k4")]),
+        "fisheye" | "equidistant_fisheye" => Lens::fisheye([
+            coefficient("k1"),
+            coefficient("k2"),
+            coefficient("k3"),
+            coefficient("k4"),
+        ]),
         other => {
             return Err(Malformed(format!(
                 "the sensor type `{other}` is not supported; undistort the photographs as frame cameras"
@@ -183,7 +190,10 @@ fn intrinsics(sensor: &Element, calibration: &Element) -> Result<DeclaredCamera,
     };
     // Old versions write fx and fy, and measure the principal point from the corner.
     let (focal, center) = match (number("f"), number("fx")) {
-        (Some(f), _) => ([f + of("b1"), f], [0.5 * width + of("cx"), 0.5 * height + of("cy")]),
+        (Some(f), _) => (
+            [f + coefficient("b1"), f],
+            [0.5 * width + coefficient("cx"), 0.5 * height + coefficient("cy")],
+        ),
         (None, Some(fx)) => (
             [fx, number("fy").unwrap_or(fx)],
             [

@@ -1,10 +1,9 @@
 //! Datasets of posed photographs. A new layout is one file here and one arm in each `match` below.
 //!
-//! A layout's reader returns what the files declare ([`declared::Declared`]); [`assemble`] then reads the image headers, skips
+//! A layout's reader returns what the files declare ([`declared::DeclaredDataset`]); [`assemble`] then reads the image headers, skips
 //! unusable views, and creates the [`Dataset`] with undistorted cameras at the requested size.
 
 mod assemble;
-mod beside;
 mod blender;
 pub(crate) mod bundler;
 pub(crate) mod colmap;
@@ -22,6 +21,7 @@ mod panoramas;
 pub(crate) mod phone;
 mod readout;
 pub(crate) mod realitycapture;
+mod sibling_folder;
 mod split;
 pub(crate) mod tokens;
 mod tracks;
@@ -30,9 +30,8 @@ mod visible;
 mod world;
 
 use crate::FormatError;
-pub(crate) use assemble::{oriented_size, turned_as_stored};
-pub use beside::Beside;
-use declared::Declared;
+pub(crate) use assemble::{colmap_orientation, oriented_size};
+use declared::DeclaredDataset;
 pub(crate) use declared::DeclaredPoints;
 pub(crate) use files::{is_image_name, list_files};
 use irradia_scene::Dataset;
@@ -40,6 +39,7 @@ pub(crate) use npy::parse_table;
 pub use panoramas::{PANORAMA_MASKS, PANORAMAS};
 pub use readout::Readout;
 use serde::{Deserialize, Serialize};
+pub use sibling_folder::SiblingFolder;
 pub use split::Holdout;
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -112,7 +112,7 @@ impl DatasetFormat {
         }
     }
 
-    fn expected(self) -> &'static str {
+    fn expected_files(self) -> &'static str {
         match self {
             Self::Colmap => "{cameras,images}.{bin,txt} in sparse/0, sparse or the folder (COLMAP)",
             Self::Nerfstudio => "transforms.json (nerfstudio, instant-ngp)",
@@ -285,26 +285,26 @@ pub fn read_dataset(path: &Path, options: &DatasetOptions) -> Result<Dataset, Fo
     };
     let Some(format) = format else {
         // For a missing folder, report the system's error.
-        let found = std::fs::metadata(path).map_err(|source| FormatError::Read {
+        let metadata = std::fs::metadata(path).map_err(|source| FormatError::Read {
             path: path.to_owned(),
             source,
         })?;
-        if found.is_file() {
+        if metadata.is_file() {
             return Err(FormatError::NotAFolder(path.to_owned()));
         }
-        let asked = options
+        let requested = options
             .format
             .map_or(DatasetFormat::ALL.to_vec(), |format| vec![format]);
         return Err(FormatError::NotADataset {
             path: path.to_owned(),
-            expected: asked
+            expected: requested
                 .into_iter()
-                .map(DatasetFormat::expected)
+                .map(DatasetFormat::expected_files)
                 .collect::<Vec<_>>()
                 .join("; "),
         });
     };
-    let mut declared: Declared = match format {
+    let mut declared: DeclaredDataset = match format {
         DatasetFormat::Colmap => colmap::read(path, options.downscale)?,
         DatasetFormat::Nerfstudio => nerfstudio::read(path, options.downscale)?,
         DatasetFormat::Blender => blender::read(path, options.downscale)?,
@@ -326,7 +326,7 @@ pub fn read_dataset(path: &Path, options: &DatasetOptions) -> Result<Dataset, Fo
         format,
         DatasetFormat::Colmap | DatasetFormat::Llff | DatasetFormat::Blender
     ) {
-        beside::find_masks(&mut declared);
+        sibling_folder::find_masks(&mut declared);
     }
     // Maps of rendered scenes are ground truth for comparisons, not input.
     match format {
@@ -335,7 +335,7 @@ pub fn read_dataset(path: &Path, options: &DatasetOptions) -> Result<Dataset, Fo
                 (view.depth, view.normals) = (None, None);
             }
         }
-        _ => beside::find_maps(&mut declared),
+        _ => sibling_folder::find_maps(&mut declared),
     }
     assemble::assemble(declared, options)
 }

@@ -2,7 +2,7 @@
 //! smaller (<https://github.com/google/nerfies#datasets>). Poses are camera-from-world rotations and camera centres, OpenCV axes.
 
 use super::declared::{
-    Declared, DeclaredCamera, DeclaredPose, DeclaredView, Focal, Split, lens_or_pinhole, pose_from_axes,
+    DeclaredCamera, DeclaredDataset, DeclaredPose, DeclaredView, Focal, Split, lens_or_pinhole, pose_from_axes,
 };
 use super::files::find_image;
 use crate::error::read_and_parse;
@@ -14,7 +14,7 @@ use std::collections::{HashMap, HashSet};
 use std::path::Path;
 
 /// Downscale factors of the folders of photographs.
-const SIZES: [u32; 5] = [1, 2, 4, 8, 16];
+const DOWNSCALE_FACTORS: [u32; 5] = [1, 2, 4, 8, 16];
 
 /// `dataset.json`.
 #[derive(Clone, Debug, Deserialize)]
@@ -70,18 +70,18 @@ pub(super) fn is_in(path: &Path) -> bool {
     path.join("dataset.json").is_file() && path.join("camera").is_dir()
 }
 
-pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError> {
+pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, FormatError> {
     let dataset = read_and_parse(&path.join("dataset.json"), parse_nerfies_dataset)?;
     let file = path.join("metadata.json");
     let metadata: HashMap<String, NerfiesMetadata> = match file.is_file() {
-        true => read_and_parse(&file, |bytes| json(bytes, "metadata"))?,
+        true => read_and_parse(&file, |bytes| parse_json(bytes, "metadata"))?,
         false => HashMap::new(),
     };
     let folder = |factor: u32| path.join(format!("rgb/{factor}x"));
-    let exact = SIZES
+    let exact = DOWNSCALE_FACTORS
         .into_iter()
         .find(|factor| downscale == *factor as f32 && folder(*factor).is_dir());
-    let Some(factor) = exact.or_else(|| SIZES.into_iter().find(|factor| folder(*factor).is_dir())) else {
+    let Some(factor) = exact.or_else(|| DOWNSCALE_FACTORS.into_iter().find(|factor| folder(*factor).is_dir())) else {
         return Err(FormatError::malformed(path, "has no photographs in rgb/1x, rgb/2x, .."));
     };
     let mut warnings = Vec::new();
@@ -109,7 +109,7 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
         } else if train.contains(id) {
             Some(Split::Train)
         } else {
-            (!train.is_empty()).then_some(Split::Left)
+            (!train.is_empty()).then_some(Split::Unlisted)
         };
         views.push(DeclaredView {
             time: time.map(|time| time as f32).filter(|time| time.is_finite()),
@@ -123,7 +123,7 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
             )
         });
     }
-    Ok(Declared {
+    Ok(DeclaredDataset {
         kind: "Nerfies",
         root: path.to_owned(),
         views,
@@ -134,8 +134,9 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
     })
 }
 
-fn json<T: for<'a> Deserialize<'a>>(bytes: &[u8], what: &str) -> Result<T, Malformed> {
-    serde_json::from_slice(bytes).map_err(|error| Malformed(format!("not a usable {what} file of Nerfies: {error}")))
+fn parse_json<T: for<'a> Deserialize<'a>>(bytes: &[u8], file_kind: &str) -> Result<T, Malformed> {
+    serde_json::from_slice(bytes)
+        .map_err(|error| Malformed(format!("not a usable {file_kind} file of Nerfies: {error}")))
 }
 
 /// Parses `dataset.json`.
@@ -143,7 +144,7 @@ fn json<T: for<'a> Deserialize<'a>>(bytes: &[u8], what: &str) -> Result<T, Malfo
 /// # Errors
 /// When it is not JSON with `ids`.
 pub fn parse_nerfies_dataset(bytes: &[u8]) -> Result<NerfiesDataset, Malformed> {
-    json(bytes, "dataset")
+    parse_json(bytes, "dataset")
 }
 
 /// Parses a file of `camera`.
@@ -151,7 +152,7 @@ pub fn parse_nerfies_dataset(bytes: &[u8]) -> Result<NerfiesDataset, Malformed> 
 /// # Errors
 /// When it is not JSON with these keys.
 pub fn parse_nerfies_camera(bytes: &[u8]) -> Result<NerfiesCamera, Malformed> {
-    json(bytes, "camera")
+    parse_json(bytes, "camera")
 }
 
 impl NerfiesCamera {

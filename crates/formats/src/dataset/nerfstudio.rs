@@ -1,6 +1,6 @@
 //! A folder with one `transforms.json`, as written by nerfstudio and instant-ngp.
 
-use super::declared::{Declared, DeclaredView, Split};
+use super::declared::{DeclaredDataset, DeclaredView, Split};
 use super::files::{find_image, relative_name};
 use super::transforms::{Frame, Transforms, parse_transforms};
 use crate::FormatError;
@@ -10,13 +10,13 @@ use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
 /// JSON files of other layouts, which can be given by their path as well.
-const OF_OTHERS: [&str; 3] = ["reconstruction.json", "metadata.json", "dataset.json"];
+const OTHER_LAYOUT_FILES: [&str; 3] = ["reconstruction.json", "metadata.json", "dataset.json"];
 
 /// The JSON file: `path` itself, or `transforms.json` in it.
 pub(super) fn find(path: &Path) -> Option<PathBuf> {
     if path
         .file_name()
-        .is_some_and(|name| OF_OTHERS.iter().any(|other| name == *other))
+        .is_some_and(|name| OTHER_LAYOUT_FILES.iter().any(|other| name == *other))
     {
         return None;
     }
@@ -31,7 +31,7 @@ pub(super) fn find(path: &Path) -> Option<PathBuf> {
     file.is_file().then_some(file)
 }
 
-pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError> {
+pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, FormatError> {
     let Some(file) = find(path) else {
         return Err(FormatError::malformed(path, "contains no transforms.json"));
     };
@@ -48,7 +48,7 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
         read.map_err(|error| warnings.push(format!("the initial points are ignored: {error}")))
             .ok()
     });
-    Ok(Declared {
+    Ok(DeclaredDataset {
         kind: "nerfstudio",
         root,
         views,
@@ -61,23 +61,23 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
 
 /// Warnings about masks and maps that frames name but that do not exist; `views` are in the order of `frames`.
 fn missing_files(frames: &[Frame], views: &[DeclaredView]) -> Vec<String> {
-    type Named = fn(&Frame) -> &Option<String>;
-    type Found = fn(&DeclaredView) -> &Option<PathBuf>;
-    let kinds: [(&str, Named, Found); 3] = [
+    type DeclaredPath = fn(&Frame) -> &Option<String>;
+    type ExistingFile = fn(&DeclaredView) -> &Option<PathBuf>;
+    let kinds: [(&str, DeclaredPath, ExistingFile); 3] = [
         ("masks", |frame| &frame.mask_path, |view| &view.mask),
         ("depth maps", Frame::depth, |view| &view.depth),
         ("normal maps", Frame::normals, |view| &view.normals),
     ];
-    let line = |(what, named, found): (&str, Named, Found)| {
-        let lacks = |(frame, view)| named(frame).as_ref().filter(|_| found(view).is_none());
-        let missing: Vec<&String> = frames.iter().zip(views).filter_map(lacks).collect();
+    let warning = |(kind, declared_path, existing_file): (&str, DeclaredPath, ExistingFile)| {
+        let missing_path = |(frame, view)| declared_path(frame).as_ref().filter(|_| existing_file(view).is_none());
+        let missing: Vec<&String> = frames.iter().zip(views).filter_map(missing_path).collect();
         let first = missing.first()?;
         Some(format!(
-            "{} {what} are missing, such as {first}: their photographs are used without them",
+            "{} {kind} are missing, such as {first}: their photographs are used without them",
             missing.len()
         ))
     };
-    kinds.into_iter().filter_map(line).collect()
+    kinds.into_iter().filter_map(warning).collect()
 }
 
 /// The frames of a transforms file.
@@ -91,7 +91,7 @@ pub(super) fn declared_views(
     let train = set(&transforms.train_filenames);
     // If a dataset lists only validation frames, those are held out.
     let (test, validation) = (set(&transforms.test_filenames), set(&transforms.val_filenames));
-    let (test, left) = if test.is_empty() {
+    let (test, unused) = if test.is_empty() {
         (validation, HashSet::new())
     } else {
         (test, validation)
@@ -101,16 +101,16 @@ pub(super) fn declared_views(
             None
         } else if test.contains(name) {
             Some(Split::Test)
-        } else if train.contains(name) || (train.is_empty() && !left.contains(name)) {
+        } else if train.contains(name) || (train.is_empty() && !unused.contains(name)) {
             Some(Split::Train)
         } else if test.is_empty() {
             Some(Split::Test)
         } else {
-            Some(Split::Left)
+            Some(Split::Unlisted)
         }
     };
     // A file beside the photograph, if it exists.
-    let beside = |path: &Option<String>| {
+    let existing_file = |path: &Option<String>| {
         let path = path.as_ref().map(|path| root.join(path.replace('\\', "/")));
         path.filter(|path| path.is_file())
     };
@@ -131,9 +131,9 @@ pub(super) fn declared_views(
             Ok(DeclaredView {
                 name: relative_name(root, image.as_deref().unwrap_or(&path)),
                 image,
-                mask: beside(&frame.mask_path),
-                depth: beside(frame.depth()),
-                normals: beside(frame.normals()),
+                mask: existing_file(&frame.mask_path),
+                depth: existing_file(frame.depth()),
+                normals: existing_file(frame.normals()),
                 pose: frame.pose(),
                 camera,
                 depth_bounds: None,

@@ -12,21 +12,21 @@ pub(crate) struct Table {
 
 /// Parses an `.npy` file of version 1 to 3 with two dimensions of 4- or 8-byte floats.
 pub(crate) fn parse_table(bytes: &[u8]) -> Result<Table, Malformed> {
-    let wrong = |what: &str| Malformed(format!("not a usable .npy file: {what}"));
+    let malformed = |reason: &str| Malformed(format!("not a usable .npy file: {reason}"));
     let rest = bytes
         .strip_prefix(b"\x93NUMPY")
-        .ok_or_else(|| wrong("it does not start with \\x93NUMPY"))?;
+        .ok_or_else(|| malformed("it does not start with \\x93NUMPY"))?;
     let (length, rest) = match rest {
         [1, _, a, b, rest @ ..] => (usize::from(u16::from_le_bytes([*a, *b])), rest),
         [2 | 3, _, a, b, c, d, rest @ ..] => (u32::from_le_bytes([*a, *b, *c, *d]) as usize, rest),
-        _ => return Err(wrong("its version is unknown or it ends too early")),
+        _ => return Err(malformed("its version is unknown or it ends too early")),
     };
     let (header, data) = rest
         .split_at_checked(length)
-        .ok_or_else(|| wrong("it ends within its header"))?;
+        .ok_or_else(|| malformed("it ends within its header"))?;
     let header = String::from_utf8_lossy(header);
 
-    let kind = value_of(&header, "descr")
+    let kind = header_value(&header, "descr")
         .map(|v| v.trim_matches(['\'', '"']))
         .unwrap_or_default();
     let (size, big_endian) = match kind {
@@ -34,9 +34,9 @@ pub(crate) fn parse_table(bytes: &[u8]) -> Result<Table, Malformed> {
         ">f8" => (8, true),
         "<f4" => (4, false),
         ">f4" => (4, true),
-        _ => return Err(wrong(&format!("its type is {kind}, not f8 or f4"))),
+        _ => return Err(malformed(&format!("its type is {kind}, not f8 or f4"))),
     };
-    let shape = value_of(&header, "shape").unwrap_or_default();
+    let shape = header_value(&header, "shape").unwrap_or_default();
     let sizes: Option<Vec<usize>> = shape
         .trim_matches(['(', ')'])
         .split(',')
@@ -45,12 +45,12 @@ pub(crate) fn parse_table(bytes: &[u8]) -> Result<Table, Malformed> {
         .map(|s| s.parse().ok())
         .collect();
     let Some([rows, columns]) = sizes.as_deref() else {
-        return Err(wrong(&format!("its shape is {shape}, not two numbers")));
+        return Err(malformed(&format!("its shape is {shape}, not two numbers")));
     };
     let (rows, columns) = (*rows, *columns);
     let needed = rows.checked_mul(columns).and_then(|count| count.checked_mul(size));
     if needed.is_none_or(|needed| needed > data.len()) {
-        return Err(wrong(&format!(
+        return Err(malformed(&format!(
             "its shape {shape} declares more than the {} bytes that follow",
             data.len()
         )));
@@ -67,9 +67,9 @@ pub(crate) fn parse_table(bytes: &[u8]) -> Result<Table, Malformed> {
             _ => f64::from(f32::from_le_bytes([native[0], native[1], native[2], native[3]])),
         }
     };
-    let by_column = value_of(&header, "fortran_order") == Some("True");
+    let column_major = header_value(&header, "fortran_order") == Some("True");
     let index = |row: usize, column: usize| {
-        if by_column {
+        if column_major {
             column * rows + row
         } else {
             row * columns + column
@@ -82,7 +82,7 @@ pub(crate) fn parse_table(bytes: &[u8]) -> Result<Table, Malformed> {
 }
 
 /// The text of a key's value in the header's Python dictionary; brackets are kept together.
-fn value_of<'a>(header: &'a str, key: &str) -> Option<&'a str> {
+fn header_value<'a>(header: &'a str, key: &str) -> Option<&'a str> {
     let start = header.find(&format!("'{key}'"))? + key.len() + 2;
     let text = header[start..].trim_start().strip_prefix(':')?.trim_start();
     let end = match text.starts_with('(') {

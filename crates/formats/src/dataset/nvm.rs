@@ -1,10 +1,10 @@
 //! VisualSfM's `.nvm`, version 3 (<http://ccwu.me/vsfm/doc.html#nvm>). Rotations are camera-from-world with x right, y down and z
 //! forward, positions are camera centres.
 
-use super::declared::{Declared, DeclaredCamera, DeclaredPose, DeclaredView, Focal, lens_or_pinhole};
+use super::declared::{DeclaredCamera, DeclaredDataset, DeclaredPose, DeclaredView, Focal, lens_or_pinhole};
 use super::files::{first_file, locate_image};
 use super::tokens::{Tokens, text};
-use super::tracks::{TrackPoint, declared, track_point};
+use super::tracks::{TrackPoint, declared_points, parse_track_point};
 use crate::error::read_and_parse;
 use crate::{FormatError, Malformed};
 use glam::DQuat;
@@ -12,9 +12,9 @@ use irradia_scene::Lens;
 use std::path::{Path, PathBuf};
 
 /// Where the photographs are, relative to the file.
-const FOLDERS: [&str; 3] = ["", "images", "../images"];
+const IMAGE_FOLDERS: [&str; 3] = ["", "images", "../images"];
 /// Numbers after a photograph's name.
-const NUMBERS: usize = 10;
+const NUMBERS_PER_IMAGE: usize = 10;
 
 /// A model: photographs, and points with the photographs that see them.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -46,7 +46,7 @@ pub(super) fn find(path: &Path) -> Option<PathBuf> {
     })
 }
 
-pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError> {
+pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, FormatError> {
     let file = find(path).ok_or_else(|| FormatError::malformed(path, "contains no .nvm file"))?;
     let models = read_and_parse(&file, parse_nvm)?;
     let root = file.parent().unwrap_or(Path::new(".")).to_owned();
@@ -60,16 +60,16 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
         let n = model.images.len();
         warnings.push(format!("the largest of {count} models is used, with {n} photographs"));
     }
-    let (points, seen) = declared(&model.points, model.images.len());
+    let (points, seen) = declared_points(&model.points, model.images.len());
     let views = model.images.iter().zip(seen).map(|(image, points_seen)| {
         let name = image.name.replace('\\', "/");
-        let found = locate_image(&root, &FOLDERS, &name);
+        let image_path = locate_image(&root, &IMAGE_FOLDERS, &name);
         DeclaredView {
             points_seen,
-            ..DeclaredView::posed(&root, &name, found, pose(image), declared_camera(image))
+            ..DeclaredView::posed(&root, &name, image_path, pose(image), declared_camera(image))
         }
     });
-    Ok(Declared {
+    Ok(DeclaredDataset {
         kind: "VisualSfM",
         views: views.collect(),
         root,
@@ -101,24 +101,24 @@ pub fn parse_nvm(bytes: &[u8]) -> Result<Vec<NvmModel>, Malformed> {
         }
         let mut model = NvmModel::default();
         for _ in 0..images {
-            model.images.push(image(lines.next().unwrap_or_default())?);
+            model.images.push(parse_image(lines.next().unwrap_or_default())?);
         }
         for _ in 0..count(lines.next())? {
             model
                 .points
-                .push(track_point(&mut Tokens::new(lines.next().unwrap_or_default()))?);
+                .push(parse_track_point(&mut Tokens::new(lines.next().unwrap_or_default()))?);
         }
         models.push(model);
     }
     Ok(models)
 }
 
-fn image(line: &str) -> Result<NvmImage, Malformed> {
+fn parse_image(line: &str) -> Result<NvmImage, Malformed> {
     // A name may have spaces, so the numbers are counted from the end.
     let words: Vec<&str> = line.split_whitespace().collect();
-    let Some(length) = words.len().checked_sub(NUMBERS).filter(|length| *length > 0) else {
+    let Some(length) = words.len().checked_sub(NUMBERS_PER_IMAGE).filter(|length| *length > 0) else {
         return Err(Malformed(format!(
-            "a photograph has a name and {NUMBERS} numbers, not `{line}`"
+            "a photograph has a name and {NUMBERS_PER_IMAGE} numbers, not `{line}`"
         )));
     };
     let numbers = words[length..].join(" ");

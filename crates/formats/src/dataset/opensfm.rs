@@ -1,8 +1,10 @@
 //! `reconstruction.json` of OpenSfM and OpenDroneMap (<https://opensfm.org/docs/dataset.html>, `geometry.html`). Poses are
 //! camera-from-world, rotations are angle times axis. Lengths on the image are relative to its longer side, from its centre.
 
-use super::declared::{Declared, DeclaredCamera, DeclaredPoints, DeclaredPose, DeclaredView, Focal, lens_or_pinhole};
-use super::files::{locate_image, named_or_in};
+use super::declared::{
+    DeclaredCamera, DeclaredDataset, DeclaredPoints, DeclaredPose, DeclaredView, Focal, lens_or_pinhole,
+};
+use super::files::{file_named, locate_image};
 use crate::error::read_and_parse;
 use crate::{FormatError, Malformed};
 use glam::{DQuat, DVec3};
@@ -12,13 +14,13 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Where OpenSfM and OpenDroneMap write it.
-const PLACES: [&str; 3] = [
+const RECONSTRUCTION_PATHS: [&str; 3] = [
     "reconstruction.json",
     "opensfm/reconstruction.json",
     "undistorted/reconstruction.json",
 ];
 /// Where the photographs are, relative to the file.
-const FOLDERS: [&str; 3] = ["images", "", "../images"];
+const IMAGE_FOLDERS: [&str; 3] = ["images", "", "../images"];
 
 /// A connected part of a scene.
 #[derive(Clone, Debug, Deserialize)]
@@ -81,29 +83,32 @@ pub struct Point {
 }
 
 pub(super) fn find(path: &Path) -> Option<PathBuf> {
-    PLACES.into_iter().find_map(|place| named_or_in(path, place))
+    RECONSTRUCTION_PATHS.into_iter().find_map(|name| file_named(path, name))
 }
 
-pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError> {
+pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, FormatError> {
     let file = find(path).ok_or_else(|| FormatError::malformed(path, "contains no reconstruction.json"))?;
-    let parts = read_and_parse(&file, parse_opensfm)?;
+    let reconstructions = read_and_parse(&file, parse_opensfm)?;
     let root = file.parent().unwrap_or(Path::new(".")).to_owned();
-    let count = parts.len();
+    let count = reconstructions.len();
     // The first of the largest.
-    let largest = parts.into_iter().rev().max_by_key(|part| part.shots.len());
-    let Some(part) = largest else {
+    let largest = reconstructions
+        .into_iter()
+        .rev()
+        .max_by_key(|reconstruction| reconstruction.shots.len());
+    let Some(reconstruction) = largest else {
         return Err(FormatError::malformed(&file, "it has no reconstruction"));
     };
     let mut warnings = Vec::new();
     if count > 1 {
-        let n = part.shots.len();
+        let n = reconstruction.shots.len();
         warnings.push(format!(
             "the largest of {count} reconstructions is used, with {n} photographs"
         ));
     }
-    let mut views = Vec::with_capacity(part.shots.len());
-    for (name, shot) in &part.shots {
-        let camera = part.cameras.get(&shot.camera).ok_or_else(|| {
+    let mut views = Vec::with_capacity(reconstruction.shots.len());
+    for (name, shot) in &reconstruction.shots {
+        let camera = reconstruction.cameras.get(&shot.camera).ok_or_else(|| {
             FormatError::malformed(
                 &file,
                 format!("{name} uses camera `{}`, which is not in the file", shot.camera),
@@ -113,14 +118,14 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<Declared, FormatError>
             path: file.clone(),
             source,
         })?;
-        let image = locate_image(&root, &FOLDERS, name);
+        let image = locate_image(&root, &IMAGE_FOLDERS, name);
         views.push(DeclaredView::posed(&root, name, image, pose(shot), camera));
     }
     let mut points = DeclaredPoints::default();
-    for point in part.points.values() {
+    for point in reconstruction.points.values() {
         points.push(point.coordinates.into(), point.color.map(|v| v as u8));
     }
-    Ok(Declared {
+    Ok(DeclaredDataset {
         kind: "OpenSfM",
         root,
         views,
@@ -171,16 +176,16 @@ fn declared_camera(camera: &Camera) -> Result<DeclaredCamera, Malformed> {
             )));
         }
     };
-    let side = camera.width.max(camera.height);
+    let longer_side = camera.width.max(camera.height);
     let focal_x = camera.focal_x.or(camera.focal).unwrap_or(f64::NAN);
     // OpenSfM writes no focal_y where it is focal_x.
     let focal_y = camera.focal_y.unwrap_or(focal_x);
     Ok(DeclaredCamera {
         size: Some([camera.width, camera.height]),
-        focal: Focal::Pixels([focal_x * side, focal_y * side]),
+        focal: Focal::Pixels([focal_x * longer_side, focal_y * longer_side]),
         center: Some([
-            0.5 * camera.width + camera.c_x * side,
-            0.5 * camera.height + camera.c_y * side,
+            0.5 * camera.width + camera.c_x * longer_side,
+            0.5 * camera.height + camera.c_y * longer_side,
         ]),
         lens: lens_or_pinhole(lens),
     })

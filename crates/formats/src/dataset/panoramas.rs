@@ -2,7 +2,7 @@
 
 use super::declared::{DeclaredCamera, DeclaredPose, DeclaredView};
 use super::files::relative_name;
-use crate::faces::sides;
+use crate::faces::cube_faces;
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -20,7 +20,7 @@ fn by_stem(folder: &Path) -> BTreeMap<String, PathBuf> {
 }
 
 /// Replaces faces of the panoramas in the dataset's folder `root` by the panoramas.
-pub(super) fn join(views: Vec<DeclaredView>, root: &Path) -> Vec<DeclaredView> {
+pub(super) fn merge_faces(views: Vec<DeclaredView>, root: &Path) -> Vec<DeclaredView> {
     let panoramas = by_stem(&root.join(PANORAMAS));
     if panoramas.is_empty() {
         return views;
@@ -65,12 +65,12 @@ pub(super) fn join(views: Vec<DeclaredView>, root: &Path) -> Vec<DeclaredView> {
 fn face_of<'a>(view: &DeclaredView, panoramas: &'a BTreeMap<String, PathBuf>) -> Option<(&'a Path, DeclaredPose)> {
     let (stem, side) = Path::new(&view.name).file_stem()?.to_str()?.rsplit_once('_')?;
     let panorama = panoramas.get(stem)?;
-    let (_, turn) = sides().into_iter().find(|(name, _)| *name == side)?;
+    let (_, rotation) = cube_faces().into_iter().find(|(name, _)| *name == side)?;
     let pose = view.pose?;
     Some((
         panorama,
         DeclaredPose {
-            rotation: pose.rotation * turn.inverse(),
+            rotation: pose.rotation * rotation.inverse(),
             ..pose
         },
     ))

@@ -1,7 +1,7 @@
 //! Captures by phones with ARKit: Polycam's and Record3D's folders. Poses are world-from-camera with OpenGL axes (x right, y up, z
 //! backward).
 
-use super::declared::{Declared, DeclaredCamera, DeclaredPose, DeclaredView, Focal, pose_from_axes};
+use super::declared::{DeclaredCamera, DeclaredDataset, DeclaredPose, DeclaredView, Focal, pose_from_axes};
 use super::files::{find_image, list_files};
 use crate::error::read_and_parse;
 use crate::{FormatError, Malformed};
@@ -11,7 +11,7 @@ use serde::Deserialize;
 use std::path::{Path, PathBuf};
 
 /// Polycam's folders of cameras and of their photographs, the adjusted ones first.
-const POLYCAM: [(&str, &str); 2] = [
+const POLYCAM_FOLDERS: [(&str, &str); 2] = [
     ("keyframes/corrected_cameras", "keyframes/corrected_images"),
     ("keyframes/cameras", "keyframes/images"),
 ];
@@ -58,7 +58,7 @@ pub struct Record3d {
 }
 
 pub(super) fn find_polycam(path: &Path) -> Option<(PathBuf, PathBuf)> {
-    POLYCAM
+    POLYCAM_FOLDERS
         .map(|(cameras, images)| (path.join(cameras), path.join(images)))
         .into_iter()
         .find(|(cameras, images)| cameras.is_dir() && images.is_dir())
@@ -69,7 +69,7 @@ pub(super) fn find_record3d(path: &Path) -> Option<PathBuf> {
     (file.is_file() && path.join("rgb").is_dir()).then_some(file)
 }
 
-pub(super) fn read_polycam(path: &Path, downscale: f32) -> Result<Declared, FormatError> {
+pub(super) fn read_polycam(path: &Path, downscale: f32) -> Result<DeclaredDataset, FormatError> {
     let Some((cameras, images)) = find_polycam(path) else {
         return Err(FormatError::malformed(path, "contains no Polycam keyframes"));
     };
@@ -85,10 +85,10 @@ pub(super) fn read_polycam(path: &Path, downscale: f32) -> Result<Declared, Form
             ..DeclaredView::posed(path, &name, image, camera.pose(), camera.intrinsics())
         });
     }
-    Ok(declared("Polycam", path, views, downscale))
+    Ok(declared_dataset("Polycam", path, views, downscale))
 }
 
-pub(super) fn read_record3d(path: &Path, downscale: f32) -> Result<Declared, FormatError> {
+pub(super) fn read_record3d(path: &Path, downscale: f32) -> Result<DeclaredDataset, FormatError> {
     let Some(file) = find_record3d(path) else {
         return Err(FormatError::malformed(path, "contains no Record3D capture"));
     };
@@ -97,8 +97,8 @@ pub(super) fn read_record3d(path: &Path, downscale: f32) -> Result<Declared, For
         let [x, y, z, w, px, py, pz] = *numbers;
         let rotation = DQuat::from_xyzw(x, y, z, w);
         let length = rotation.length();
-        let turn = (length.is_finite() && length > 1e-6).then(|| DMat3::from_quat(rotation / length));
-        let pose = turn.and_then(|turn| from_opengl(turn, DVec3::new(px, py, pz)));
+        let matrix = (length.is_finite() && length > 1e-6).then(|| DMat3::from_quat(rotation / length));
+        let pose = matrix.and_then(|matrix| pose_from_opengl(matrix, DVec3::new(px, py, pz)));
         let k = &capture.k;
         let [fx, fy, cx, cy] = capture.per_frame.get(i).copied().unwrap_or([k[0], k[4], k[6], k[7]]);
         let camera = pinhole([capture.w, capture.h], [fx, fy], [cx, cy]);
@@ -106,7 +106,7 @@ pub(super) fn read_record3d(path: &Path, downscale: f32) -> Result<Declared, For
         DeclaredView::posed(path, &name, find_image(&path.join(&name)), pose, camera)
     };
     let views = capture.poses.iter().enumerate().map(view).collect();
-    Ok(declared("Record3D", path, views, downscale))
+    Ok(declared_dataset("Record3D", path, views, downscale))
 }
 
 /// Parses a camera of Polycam.
@@ -130,7 +130,7 @@ impl PolycamCamera {
         let right = DVec3::new(self.t_00, self.t_10, self.t_20);
         let up = DVec3::new(self.t_01, self.t_11, self.t_21);
         let backward = DVec3::new(self.t_02, self.t_12, self.t_22);
-        from_opengl(
+        pose_from_opengl(
             DMat3::from_cols(right, up, backward),
             DVec3::new(self.t_03, self.t_13, self.t_23),
         )
@@ -141,8 +141,8 @@ impl PolycamCamera {
     }
 }
 
-fn from_opengl(turn: DMat3, position: DVec3) -> Option<DeclaredPose> {
-    pose_from_axes(turn.x_axis, -turn.y_axis, -turn.z_axis, position)
+fn pose_from_opengl(rotation: DMat3, position: DVec3) -> Option<DeclaredPose> {
+    pose_from_axes(rotation.x_axis, -rotation.y_axis, -rotation.z_axis, position)
 }
 
 fn pinhole(size: [f64; 2], focal: [f64; 2], center: [f64; 2]) -> DeclaredCamera {
@@ -154,8 +154,8 @@ fn pinhole(size: [f64; 2], focal: [f64; 2], center: [f64; 2]) -> DeclaredCamera 
     }
 }
 
-fn declared(kind: &'static str, root: &Path, views: Vec<DeclaredView>, downscale: f32) -> Declared {
-    Declared {
+fn declared_dataset(kind: &'static str, root: &Path, views: Vec<DeclaredView>, downscale: f32) -> DeclaredDataset {
+    DeclaredDataset {
         kind,
         root: root.to_owned(),
         views,

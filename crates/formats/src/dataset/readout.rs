@@ -44,13 +44,13 @@ impl FromStr for Readout {
 
 /// The shutter from velocities in OpenGL axes, per second, and the time of a readout from top to bottom, seconds: the keys of "Gaussian
 /// Splatting on the Move". `None` for a camera at rest, and for one that rotates so far that velocity or time must be in another unit.
-pub(super) fn of_velocities(linear: Velocity, angular: Velocity, seconds: f64) -> Option<RollingShutter> {
+pub(super) fn shutter_from_velocities(linear: Velocity, angular: Velocity, seconds: f64) -> Option<RollingShutter> {
     let opencv = |[x, y, z]: Velocity| Some((DVec3::new(x?, -y?, -z?) * seconds).as_vec3());
     let (translation, rotation) = (opencv(linear)?, opencv(angular)?);
-    let moves = translation.is_finite()
+    let is_moving = translation.is_finite()
         && rotation.length() <= RollingShutter::MOST_TURNED
         && (translation, rotation) != Default::default();
-    moves.then_some(RollingShutter {
+    is_moving.then_some(RollingShutter {
         first: FirstSide::Top,
         translation,
         rotation,
@@ -59,10 +59,10 @@ pub(super) fn of_velocities(linear: Velocity, angular: Velocity, seconds: f64) -
 
 /// Gives the frames of films, which are numbered by time, shutters from the poses of their neighbours. Frames that have a shutter keep it,
 /// and frames that would rotate too far get none. Returns how many views have one.
-pub(super) fn of_neighbours(views: &mut [DeclaredView], readout: &Readout) -> usize {
+pub(super) fn estimate_shutters(views: &mut [DeclaredView], readout: &Readout) -> usize {
     let mut films: BTreeMap<String, BTreeMap<u64, usize>> = BTreeMap::new();
     for (index, view) in views.iter().enumerate().filter(|(_, view)| view.pose.is_some()) {
-        if let Some((film, number)) = numbered(&view.name) {
+        if let Some((film, number)) = film_and_number(&view.name) {
             films.entry(film).or_default().insert(number, index);
         }
     }
@@ -75,9 +75,9 @@ pub(super) fn of_neighbours(views: &mut [DeclaredView], readout: &Readout) -> us
                 continue;
             }
             let pose = |at: usize| views[at].pose.expect("those of films are posed");
-            let moved = movement(&pose(*index), &pose(*before.1), &pose(*after.1));
+            let motion = relative_motion(&pose(*index), &pose(*before.1), &pose(*after.1));
             let per_readout = readout.frames / (after.0 - before.0) as f64;
-            let [translation, rotation] = moved.map(|moved| (moved * per_readout).as_vec3());
+            let [translation, rotation] = motion.map(|motion| (motion * per_readout).as_vec3());
             if rotation.length() > RollingShutter::MOST_TURNED {
                 continue;
             }
@@ -92,21 +92,21 @@ pub(super) fn of_neighbours(views: &mut [DeclaredView], readout: &Readout) -> us
 }
 
 /// Translation and rotation from `before` to `after`, along and about the axes of `camera`.
-fn movement(camera: &DeclaredPose, before: &DeclaredPose, after: &DeclaredPose) -> [DVec3; 2] {
-    let turn = before.rotation.inverse() * after.rotation;
-    let shorter = if turn.w < 0.0 { -turn } else { turn };
+fn relative_motion(camera: &DeclaredPose, before: &DeclaredPose, after: &DeclaredPose) -> [DVec3; 2] {
+    let rotation = before.rotation.inverse() * after.rotation;
+    let shortest = if rotation.w < 0.0 { -rotation } else { rotation };
     [
         camera.rotation.inverse() * (after.position - before.position),
-        shorter.to_scaled_axis(),
+        shortest.to_scaled_axis(),
     ]
 }
 
 /// The part of a frame's name that its film's frames have in common, and its number: the digits at the end of its stem.
-fn numbered(name: &str) -> Option<(String, u64)> {
+fn film_and_number(name: &str) -> Option<(String, u64)> {
     let path = Path::new(name);
     let stem = path.file_stem()?.to_str()?;
-    let digits = stem.trim_end_matches(|c: char| c.is_ascii_digit()).len();
-    let (film, number) = stem.split_at(digits);
+    let digits_start = stem.trim_end_matches(|c: char| c.is_ascii_digit()).len();
+    let (film, number) = stem.split_at(digits_start);
     Some((format!("{}/{film}", path.parent()?.display()), number.parse().ok()?))
 }
 
@@ -152,7 +152,7 @@ mod tests {
             view("b/film_013.jpg", 70.0),
         ];
         let readout = "0.5:right".parse().expect("a readout");
-        assert_eq!(of_neighbours(&mut views, &readout), 3);
+        assert_eq!(estimate_shutters(&mut views, &readout), 3);
         for (view, angle) in views.iter().zip([0.0f64, 0.2, 0.6]) {
             let shutter = view.shutter.expect("it has neighbours");
             let along = DVec3::new(0.5 * angle.cos(), 0.0, 0.5 * angle.sin());

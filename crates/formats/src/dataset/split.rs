@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 const TEST_LISTS: [&str; 2] = ["test_images.txt", "test.txt"];
 const TRAIN_LISTS: [&str; 2] = ["train_images.txt", "train.txt"];
 /// Folders of these lists: the dataset's own, and the Inria code's location.
-const FOLDERS: [&str; 2] = ["", "sparse/0"];
+const LIST_FOLDERS: [&str; 2] = ["", "sparse/0"];
 /// Maximum number of names in a warning.
 const MAX_NAMES: usize = 3;
 
@@ -29,13 +29,13 @@ pub enum Holdout {
 }
 
 /// A list of image names.
-struct List {
+struct NameList {
     /// The file it was read from.
     file: String,
     names: HashSet<String>,
 }
 
-impl List {
+impl NameList {
     fn parse(file: String, text: &str) -> Self {
         // Some editors begin a text with a byte order mark.
         let lines = text
@@ -49,13 +49,13 @@ impl List {
         Self { file, names }
     }
 
-    fn has(&self, name: &str) -> bool {
-        names_of(name).any(|n| self.names.contains(n))
+    fn contains(&self, name: &str) -> bool {
+        name_variants(name).any(|n| self.names.contains(n))
     }
 
     /// The warning about names that match none of the views `names`.
     fn missing_warning(&self, names: &[String]) -> Option<String> {
-        let known: HashSet<&str> = names.iter().flat_map(|name| names_of(name)).collect();
+        let known: HashSet<&str> = names.iter().flat_map(|name| name_variants(name)).collect();
         let names = self.names.iter().map(String::as_str);
         let mut missing: Vec<&str> = names.filter(|name| !known.contains(name)).collect();
         missing.sort_unstable();
@@ -88,7 +88,7 @@ pub(super) fn split(
     names: &[String],
     mut splits: Vec<Option<Split>>,
 ) -> Result<Indices, FormatError> {
-    let by = |held_out: &dyn Fn(usize) -> bool| {
+    let split_by = |held_out: &dyn Fn(usize) -> bool| {
         let (test, train) = (0..names.len()).partition(|i| held_out(*i));
         Indices {
             train,
@@ -99,19 +99,19 @@ pub(super) fn split(
     let mut indices = match holdout {
         Holdout::AsDeclared => {
             let warning = apply_lists(root, names, &mut splits);
-            let mut declared = declared(&splits);
+            let mut declared = declared_split(&splits);
             declared.warning = warning.or(declared.warning);
             declared
         }
-        Holdout::Every(n) => by(&|i| i.is_multiple_of(*n)),
-        Holdout::Nothing => by(&|_| false),
+        Holdout::Every(n) => split_by(&|i| i.is_multiple_of(*n)),
+        Holdout::Nothing => split_by(&|_| false),
         Holdout::Listed(file) => {
             let text = std::fs::read_to_string(file).map_err(|source| FormatError::Read {
                 path: file.clone(),
                 source,
             })?;
-            let list = List::parse(file.display().to_string(), &text);
-            let listed = by(&|i| list.has(&names[i]));
+            let list = NameList::parse(file.display().to_string(), &text);
+            let listed = split_by(&|i| list.contains(&names[i]));
             if listed.test.is_empty() {
                 return Err(FormatError::Option(format!(
                     "holdout {}: the list names none of the {} views, such as {}",
@@ -139,12 +139,12 @@ fn apply_lists(root: &Path, names: &[String], splits: &mut [Option<Split>]) -> O
         return None;
     }
     let (test, train) = (read_list(root, TEST_LISTS), read_list(root, TRAIN_LISTS));
-    let is_in = |list: &Option<List>, name: &str| list.as_ref().is_some_and(|list| list.has(name));
+    let is_in = |list: &Option<NameList>, name: &str| list.as_ref().is_some_and(|list| list.contains(name));
     let in_test: Vec<bool> = names.iter().map(|name| is_in(&test, name)).collect();
     let in_train: Vec<bool> = names.iter().map(|name| is_in(&train, name)).collect();
-    for (list, found) in [(&test, &in_test), (&train, &in_train)] {
+    for (list, matched) in [(&test, &in_test), (&train, &in_train)] {
         if let Some(list) = list
-            && !found.contains(&true)
+            && !matched.contains(&true)
         {
             return Some(format!(
                 "{} names none of the images and is ignored; every 8th view is held out",
@@ -161,14 +161,14 @@ fn apply_lists(root: &Path, names: &[String], splits: &mut [Option<Split>]) -> O
             (_, true) => Split::Train,
             _ if train.is_none() => Split::Train,
             _ if test.is_none() => Split::Test,
-            _ => Split::Left,
+            _ => Split::Unlisted,
         });
     }
     None
 }
 
 /// The dataset's own split; every 8th view is held out if it has none.
-fn declared(splits: &[Option<Split>]) -> Indices {
+fn declared_split(splits: &[Option<Split>]) -> Indices {
     if splits.iter().all(Option::is_none) {
         let (train, test) = every_eighth(splits.len());
         return Indices {
@@ -177,21 +177,21 @@ fn declared(splits: &[Option<Split>]) -> Indices {
             warning: None,
         };
     }
-    let with = |wanted: &[Option<Split>]| {
+    let indices_of = |wanted: &[Option<Split>]| {
         (0..splits.len())
             .filter(|i| wanted.contains(&splits[*i]))
             .collect::<Vec<_>>()
     };
     Indices {
-        train: with(&[Some(Split::Train), None]),
-        test: with(&[Some(Split::Test)]),
+        train: indices_of(&[Some(Split::Train), None]),
+        test: indices_of(&[Some(Split::Test)]),
         warning: None,
     }
 }
 
 /// The forms in which lists may give a view's name: complete or below the folder of images, each with and without the extension,
 /// or its last part with and without the extension.
-fn names_of(name: &str) -> impl Iterator<Item = &str> {
+fn name_variants(name: &str) -> impl Iterator<Item = &str> {
     let below = name.split_once('/').map_or(name, |(_, below)| below);
     let last = name.rsplit('/').next().unwrap_or(name);
     let stem = |name| Path::new(name).file_stem().and_then(|s| s.to_str()).unwrap_or(name);
@@ -200,13 +200,13 @@ fn names_of(name: &str) -> impl Iterator<Item = &str> {
     [name, below, bare, bare_below, last, stem(last)].into_iter()
 }
 
-fn read_list(root: &Path, files: [&str; 2]) -> Option<List> {
-    let candidates = FOLDERS
+fn read_list(root: &Path, files: [&str; 2]) -> Option<NameList> {
+    let candidates = LIST_FOLDERS
         .iter()
         .flat_map(|folder| files.iter().map(move |file| Path::new(folder).join(file)));
     for candidate in candidates {
         if let Ok(text) = std::fs::read_to_string(root.join(&candidate)) {
-            return Some(List::parse(candidate.display().to_string(), &text));
+            return Some(NameList::parse(candidate.display().to_string(), &text));
         }
     }
     None
@@ -221,7 +221,7 @@ mod tests {
     }
 
     /// Training and held-out views of four views without a declared split.
-    fn of(holdout: Holdout, root: &Path) -> (Vec<usize>, Vec<usize>) {
+    fn indices_for(holdout: Holdout, root: &Path) -> (Vec<usize>, Vec<usize>) {
         let indices = split(&holdout, root, &names(), vec![None; 4]).unwrap();
         (indices.train, indices.test)
     }
@@ -231,14 +231,14 @@ mod tests {
         for line in ["images/2.png", "2.png", "images/2", "2", "./2.png\n"] {
             let root = tempfile::tempdir().unwrap();
             std::fs::write(root.path().join("test.txt"), format!("# held out\n{line}\n")).unwrap();
-            assert_eq!(of(Holdout::AsDeclared, root.path()), (vec![0, 1, 3], vec![2]));
+            assert_eq!(indices_for(Holdout::AsDeclared, root.path()), (vec![0, 1, 3], vec![2]));
             let listed = Holdout::Listed(root.path().join("test.txt"));
-            assert_eq!(of(listed, Path::new("elsewhere")), (vec![0, 1, 3], vec![2]));
+            assert_eq!(indices_for(listed, Path::new("elsewhere")), (vec![0, 1, 3], vec![2]));
         }
     }
 
     #[test]
-    fn a_file_name_matches_in_any_folder_and_names_without_a_view_are_told() {
+    fn a_file_name_matches_in_any_folder_and_names_without_a_view_are_reported() {
         let root = tempfile::tempdir().unwrap();
         let file = root.path().join("list.txt");
         std::fs::write(&file, "\u{feff}1.jpg\nx.jpg\ny\n").unwrap();
@@ -271,19 +271,19 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         std::fs::write(root.path().join("test.txt"), "0").unwrap();
         std::fs::write(root.path().join("train.txt"), "1\n3").unwrap();
-        assert_eq!(of(Holdout::AsDeclared, root.path()), (vec![1, 3], vec![0]));
+        assert_eq!(indices_for(Holdout::AsDeclared, root.path()), (vec![1, 3], vec![0]));
     }
 
     #[test]
     fn a_requested_split_overrides_the_declared_one() {
         let root = tempfile::tempdir().unwrap();
-        let declared = vec![Some(Split::Train), Some(Split::Test), Some(Split::Left), None];
-        let of = |holdout: Holdout| split(&holdout, root.path(), &names(), declared.clone()).unwrap();
-        let indices = of(Holdout::AsDeclared);
+        let declared = vec![Some(Split::Train), Some(Split::Test), Some(Split::Unlisted), None];
+        let indices_for = |holdout: Holdout| split(&holdout, root.path(), &names(), declared.clone()).unwrap();
+        let indices = indices_for(Holdout::AsDeclared);
         assert_eq!((indices.train, indices.test), (vec![0, 3], vec![1]));
-        let indices = of(Holdout::Every(3));
+        let indices = indices_for(Holdout::Every(3));
         assert_eq!((indices.train, indices.test), (vec![1, 2], vec![0, 3]));
-        let indices = of(Holdout::Nothing);
+        let indices = indices_for(Holdout::Nothing);
         assert_eq!((indices.train, indices.warning), (vec![0, 1, 2, 3], None));
     }
 

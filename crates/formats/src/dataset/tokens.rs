@@ -15,30 +15,30 @@ impl<'a> Tokens<'a> {
         }
     }
 
-    /// The next number; `what` names it in the error.
-    pub fn next<T: FromStr>(&mut self, what: &str) -> Result<T, Malformed> {
+    /// The next number; `label` names it in the error.
+    pub fn next<T: FromStr>(&mut self, label: &str) -> Result<T, Malformed> {
         let word = self
             .words
             .next()
-            .ok_or_else(|| Malformed(format!("ends where {what} is expected; the file is truncated")))?;
+            .ok_or_else(|| Malformed(format!("ends where {label} is expected; the file is truncated")))?;
         word.parse()
-            .map_err(|_| Malformed(format!("`{word}` found where {what} is expected")))
+            .map_err(|_| Malformed(format!("`{word}` found where {label} is expected")))
     }
 
     /// The next `N` numbers.
-    pub fn numbers<const N: usize>(&mut self, what: &str) -> Result<[f64; N], Malformed> {
+    pub fn numbers<const N: usize>(&mut self, label: &str) -> Result<[f64; N], Malformed> {
         let mut numbers = [0.0; N];
         for number in &mut numbers {
-            *number = self.next(what)?;
+            *number = self.next(label)?;
         }
         Ok(numbers)
     }
 
     /// Skips `count` words.
-    pub fn skip(&mut self, count: usize, what: &str) -> Result<(), Malformed> {
+    pub fn skip(&mut self, count: usize, label: &str) -> Result<(), Malformed> {
         for _ in 0..count {
             if self.words.next().is_none() {
-                return Err(Malformed(format!("ends within {what}; the file is truncated")));
+                return Err(Malformed(format!("ends within {label}; the file is truncated")));
             }
         }
         Ok(())

@@ -8,20 +8,20 @@ use crate::Malformed;
 pub type TrackPoint = ([f64; 3], [u8; 3], Vec<usize>);
 
 /// Reads a point: position, colour, the number of its views, and four words per view, the first of which is the photograph's number.
-pub(super) fn track_point(tokens: &mut Tokens) -> Result<TrackPoint, Malformed> {
+pub(super) fn parse_track_point(tokens: &mut Tokens) -> Result<TrackPoint, Malformed> {
     let position = tokens.numbers("a point")?;
     let color = tokens.numbers::<3>("a colour")?.map(|v| v as u8);
     let views: usize = tokens.next("a count of views")?;
-    let mut seen = Vec::new();
+    let mut seen_by = Vec::new();
     for _ in 0..views {
-        seen.push(tokens.next("a view")?);
+        seen_by.push(tokens.next("a view")?);
         tokens.skip(3, "a list of views")?;
     }
-    Ok((position, color, seen))
+    Ok((position, color, seen_by))
 }
 
 /// The usable points, and the indices of those that each of `photos` photographs sees.
-pub(super) fn declared(tracks: &[TrackPoint], photos: usize) -> (DeclaredPoints, Vec<Vec<u32>>) {
+pub(super) fn declared_points(tracks: &[TrackPoint], photos: usize) -> (DeclaredPoints, Vec<Vec<u32>>) {
     let mut points = DeclaredPoints::default();
     let mut seen = vec![Vec::new(); photos];
     for (position, color, photos) in tracks {

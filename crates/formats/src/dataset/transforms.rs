@@ -1,7 +1,7 @@
 //! `transforms*.json`: cameras and frames of NeRF's Blender scenes, instant-ngp and nerfstudio.
 
 use super::declared::{DeclaredCamera, DeclaredPose, Focal, lens_or_pinhole, pose_from_axes};
-use super::readout::of_velocities;
+use super::readout::shutter_from_velocities;
 use crate::Malformed;
 use glam::DVec3;
 use irradia_scene::{Lens, RollingShutter};
@@ -243,7 +243,7 @@ impl Frame {
 
     /// How the camera moved while the photograph was read out.
     pub(super) fn shutter(&self, seconds: Option<f64>) -> Option<RollingShutter> {
-        of_velocities(self.camera_linear_velocity?, self.camera_angular_velocity?, seconds?)
+        shutter_from_velocities(self.camera_linear_velocity?, self.camera_angular_velocity?, seconds?)
     }
 }
 

@@ -8,60 +8,63 @@ use irradia_scene::{PointCloud, View};
 use rayon::prelude::*;
 
 /// Cells of the grid along the longer side of a view: about one point per cell for a thousand points in view.
-const CELLS: f32 = 40.0;
+const CELLS_PER_SIDE: f32 = 40.0;
 /// Maximum depth of a point that is seen, relative to the nearest point around it.
-const BEHIND: f32 = 1.1;
+const MAX_DEPTH_RATIO: f32 = 1.1;
 /// Minimum number of views that see a point, and minimum fraction of the points that so many views see. Fractions in scenes by `synth`,
 /// compared with their true depths: room 0.92 (96 % of the points found are truly seen), shelf 0.82 (94 %), thin 0.73 (86 %: its depths
 /// cost 0.9 dB), outdoor 0.63; in fox and lund_door 0.98.
-const WITNESSES: u32 = 3;
-const SEEN: f64 = 0.8;
+const MIN_VIEWS: u32 = 3;
+const MIN_SEEN_FRACTION: f64 = 0.8;
 /// Number of points that is enough: if there are more, an evenly spaced subset is used.
-const ENOUGH: usize = 50_000;
+const MAX_POINTS: usize = 50_000;
 
 /// Sets the points that `views` see, if no view has any.
 pub(super) fn find_points_seen(views: &mut [View], points: Option<&PointCloud>) {
     let Some(points) = points.filter(|_| views.iter().all(|view| view.points_seen.is_empty())) else {
         return;
     };
-    let every = points.positions.len().div_ceil(ENOUGH).max(1);
-    let seen: Vec<Vec<u32>> = views.par_iter().map(|view| seen_by(view, points, every)).collect();
-    let mut witnesses = vec![0u32; points.positions.len()];
+    let step = points.positions.len().div_ceil(MAX_POINTS).max(1);
+    let seen: Vec<Vec<u32>> = views
+        .par_iter()
+        .map(|view| visible_points(view, points, step))
+        .collect();
+    let mut view_counts = vec![0u32; points.positions.len()];
     for point in seen.iter().flatten() {
-        witnesses[*point as usize] += 1;
+        view_counts[*point as usize] += 1;
     }
-    let witnessed = witnesses.iter().filter(|count| **count >= WITNESSES).count();
-    if witnessed as f64 >= SEEN * witnesses.len().div_ceil(every) as f64 {
+    let seen_points = view_counts.iter().filter(|count| **count >= MIN_VIEWS).count();
+    if seen_points as f64 >= MIN_SEEN_FRACTION * view_counts.len().div_ceil(step) as f64 {
         for (view, mut seen) in views.iter_mut().zip(seen) {
-            seen.retain(|point| witnesses[*point as usize] >= WITNESSES);
+            seen.retain(|point| view_counts[*point as usize] >= MIN_VIEWS);
             view.points_seen = seen;
         }
     }
 }
 
-/// The points in `view` that no other point hides, of every `every`-th point.
-fn seen_by(view: &View, points: &PointCloud, every: usize) -> Vec<u32> {
+/// The points in `view` that no other point hides, of every `step`-th point.
+fn visible_points(view: &View, points: &PointCloud, step: usize) -> Vec<u32> {
     let k = &view.camera.intrinsics;
-    let side = k.width.max(k.height) as f32 / CELLS;
-    let [columns, rows] = [k.width, k.height].map(|length| (length as f32 / side) as usize + 1);
-    let mut inside = Vec::new();
+    let cell_size = k.width.max(k.height) as f32 / CELLS_PER_SIDE;
+    let [columns, rows] = [k.width, k.height].map(|length| (length as f32 / cell_size) as usize + 1);
+    let mut in_view = Vec::new();
     // With a border, so that each cell has eight neighbours.
     let stride = columns + 2;
     let mut nearest = vec![f32::INFINITY; stride * (rows + 2)];
-    for (i, position) in points.positions.iter().enumerate().step_by(every) {
+    for (i, position) in points.positions.iter().enumerate().step_by(step) {
         if let Some((pixel, depth)) = view.camera.sees(*position) {
-            let cell = ((pixel.y / side) as usize + 1) * stride + (pixel.x / side) as usize + 1;
+            let cell = ((pixel.y / cell_size) as usize + 1) * stride + (pixel.x / cell_size) as usize + 1;
             nearest[cell] = nearest[cell].min(depth);
-            inside.push((i as u32, cell, depth));
+            in_view.push((i as u32, cell, depth));
         }
     }
-    let around = |cell: usize| {
+    let nearest_around = |cell: usize| {
         let rows = [cell - stride, cell, cell + stride];
         let values = rows.into_iter().flat_map(|middle| [middle - 1, middle, middle + 1]);
         values.map(|cell| nearest[cell]).fold(f32::INFINITY, f32::min)
     };
-    inside.retain(|(_, cell, depth)| *depth <= BEHIND * around(*cell));
-    inside.into_iter().map(|(point, ..)| point).collect()
+    in_view.retain(|(_, cell, depth)| *depth <= MAX_DEPTH_RATIO * nearest_around(*cell));
+    in_view.into_iter().map(|(point, ..)| point).collect()
 }
 
 #[cfg(test)]
@@ -128,10 +131,10 @@ mod tests {
             assert!(behind.clone().count() > 1000 && behind.filter(through).count() == 0);
         }
         // What a dataset declares is not replaced.
-        let mut told = views();
-        told[0].points_seen = vec![7];
-        find_points_seen(&mut told, Some(&points));
-        assert!(told[0].points_seen == [7] && told[1].points_seen.is_empty());
+        let mut declared = views();
+        declared[0].points_seen = vec![7];
+        find_points_seen(&mut declared, Some(&points));
+        assert!(declared[0].points_seen == [7] && declared[1].points_seen.is_empty());
     }
 
     #[test]

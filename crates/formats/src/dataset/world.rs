@@ -6,34 +6,30 @@ use irradia_scene::Similarity;
 /// Distance of the cameras' median from the origin above which the origin is moved there, in units of the median distance of a camera
 /// from that median. At this limit, neighbouring `f32` values are up to 1e-5 of these units apart: a hundredth of a pixel in most
 /// photographs.
-const FARTHEST: f64 = 100.0;
+const MAX_ORIGIN_DISTANCE: f64 = 100.0;
 /// Range of the median distance of a camera from the cameras' median, in the files' unit, in which that unit is kept: from a hand-held
 /// close-up to a building, both in metres. It also covers the arbitrary units of structure from motion.
-const USUAL: [f64; 2] = [0.1, 50.0];
+const RADIUS_RANGE: [f64; 2] = [0.1, 50.0];
 
 /// The world of cameras at `positions`. Its origin is the cameras' median if that is far from the files' origin. If the median distance
-/// of a camera from there is not within [`USUAL`], the unit is a power of ten of the files', such that this distance is 1 to 10 units;
-/// constants in world units, like the near plane, then follow the scene's size. Medians, since one camera may be misplaced.
+/// of a camera from there is not within [`RADIUS_RANGE`], the unit is a power of ten of the files', such that this distance is 1 to 10
+/// units; constants in world units, like the near plane, then follow the scene's size. Medians, since one camera may be misplaced.
 pub(super) fn world_from_dataset(positions: &[DVec3]) -> Similarity {
-    let along = |axis: usize| median(positions.iter().map(|p| p[axis]).collect());
-    let center = DVec3::new(along(0), along(1), along(2));
+    let median_along = |axis: usize| median(positions.iter().map(|p| p[axis]).collect());
+    let center = DVec3::new(median_along(0), median_along(1), median_along(2));
     let radius = median(positions.iter().map(|p| p.distance(center)).collect());
-    let keeps_units = radius == 0.0 || (USUAL[0]..=USUAL[1]).contains(&radius);
+    let keeps_units = radius == 0.0 || (RADIUS_RANGE[0]..=RADIUS_RANGE[1]).contains(&radius);
     let scale = if keeps_units {
         1.0
     } else {
         10f64.powf(-radius.log10().floor())
     };
-    let is_far = center.length() > FARTHEST * radius;
-    let chosen = Similarity {
+    let moves_origin = center.length() > MAX_ORIGIN_DISTANCE * radius;
+    let world = Similarity {
         scale,
-        center: if is_far { center } else { DVec3::ZERO },
+        center: if moves_origin { center } else { DVec3::ZERO },
     };
-    if chosen.is_valid() {
-        chosen
-    } else {
-        Similarity::IDENTITY
-    }
+    if world.is_valid() { world } else { Similarity::IDENTITY }
 }
 
 /// The middle value; 0 if there is none.

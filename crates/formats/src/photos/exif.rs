@@ -61,8 +61,8 @@ fn numbers(exif: &Exif, tag: Tag) -> Option<Vec<f64>> {
 
 /// From the 35 mm equivalent focal length, or from the focal length in millimetres and the density of the sensor's pixels.
 fn focal(exif: &Exif, size: [u32; 2]) -> Option<f64> {
-    let film = number(exif, Tag::FocalLengthIn35mmFilm).filter(|mm| *mm > 0.0);
-    if let Some(mm) = film {
+    let equivalent = number(exif, Tag::FocalLengthIn35mmFilm).filter(|mm| *mm > 0.0);
+    if let Some(mm) = equivalent {
         return Some(mm / FILM_WIDTH_MM);
     }
     let mm = number(exif, Tag::FocalLength).filter(|mm| *mm > 0.0)?;
@@ -75,8 +75,8 @@ fn focal(exif: &Exif, size: [u32; 2]) -> Option<f64> {
         _ => 25.4,
     };
     // The density is that of the photograph as taken, which may have been larger.
-    let taken = number(exif, Tag::PixelXDimension).filter(|width| *width > 0.0);
-    let width = taken.unwrap_or(f64::from(size[0]));
+    let original_width = number(exif, Tag::PixelXDimension).filter(|width| *width > 0.0);
+    let width = original_width.unwrap_or(f64::from(size[0]));
     let [short, long] = [size[0].min(size[1]), size[0].max(size[1])].map(f64::from);
     let long = if size[0] >= size[1] {
         width
@@ -103,9 +103,9 @@ fn gps(exif: &Exif) -> Option<[f64; 3]> {
         // A place in the sea, which some cameras write before they know their position.
         return None;
     }
-    let below = number(exif, Tag::GPSAltitudeRef) == Some(1.0);
+    let below_sea_level = number(exif, Tag::GPSAltitudeRef) == Some(1.0);
     let altitude = number(exif, Tag::GPSAltitude).unwrap_or(0.0);
-    Some([latitude, longitude, if below { -altitude } else { altitude }])
+    Some([latitude, longitude, if below_sea_level { -altitude } else { altitude }])
 }
 
 #[cfg(test)]

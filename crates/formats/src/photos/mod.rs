@@ -4,10 +4,11 @@ mod exif;
 mod gimbal;
 mod panorama;
 
-use crate::dataset::{Beside, is_image_name, list_files, oriented_size, turned_as_stored};
+use crate::dataset::{SiblingFolder, colmap_orientation, is_image_name, list_files, oriented_size};
 use crate::error::read_file;
-use crate::image_file::{Colour, decode, decode_jpeg_at, decode_mask, read_header, read_metadata};
-use crate::{FormatError, Pixels};
+use crate::image_file::{Colour, decode, decode_jpeg_scaled, decode_mask, read_header, read_metadata};
+use crate::photo::MASK_THRESHOLD;
+use crate::{FormatError, Pixels, write_png};
 pub use exif::{CameraTags, parse_camera_tags};
 pub use gimbal::parse_gimbal;
 use glam::DVec3;
@@ -19,7 +20,7 @@ use std::collections::{BTreeMap, HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 /// Extensions of image files that are not supported: cameras' raw files, and others.
-const UNREAD: [&str; 15] = [
+const UNSUPPORTED_EXTENSIONS: [&str; 15] = [
     "dng", "cr2", "cr3", "nef", "arw", "orf", "rw2", "raf", "srw", "pef", "avif", "jxl", "bmp", "gif", "jp2",
 ];
 
@@ -58,17 +59,17 @@ impl PhotoEntry {
     }
 
     /// The pixels, with 3 or 4 channels; a large JPEG is decoded at a half, quarter or eighth of its size if its longer side still has
-    /// at least `side` pixels.
+    /// at least `min_side` pixels.
     ///
     /// # Errors
     /// When the file cannot be read or decoded.
-    pub fn read(&self, side: u32) -> Result<Pixels, FormatError> {
-        let long = self.width.max(self.height);
-        let fraction = [8, 4, 2]
+    pub fn read(&self, min_side: u32) -> Result<Pixels, FormatError> {
+        let longer_side = self.width.max(self.height);
+        let divisor = [8, 4, 2]
             .into_iter()
-            .find(|divisor| self.jpeg && long / divisor >= side);
-        match fraction {
-            Some(divisor) => decode_jpeg_at(&self.path, divisor, self.orientation),
+            .find(|divisor| self.jpeg && longer_side / divisor >= min_side);
+        match divisor {
+            Some(divisor) => decode_jpeg_scaled(&self.path, divisor, self.orientation),
             None => decode(&self.path, self.orientation, Colour::Keep),
         }
     }
@@ -106,7 +107,7 @@ impl PhotoEntry {
     /// When the file cannot be read or decoded.
     pub fn read_mask(&self, width: u32, height: u32) -> Result<Option<Vec<u8>>, FormatError> {
         let Some(path) = &self.mask else { return Ok(None) };
-        let orientation = read_header(path)?.turned_with(self.orientation, (self.width, self.height));
+        let orientation = read_header(path)?.orientation_from_photo(self.orientation, (self.width, self.height));
         let mask = decode_mask(path, orientation)?;
         Ok(Some(resize_area(
             &mask.data,
@@ -114,6 +115,20 @@ impl PhotoEntry {
             [mask.width, mask.height],
             [width, height],
         )))
+    }
+
+    /// Writes the mask, if there is one, as a PNG of black and white, for programs that read no other masks. Its pixels are as stored, like
+    /// those of the photograph for such programs.
+    ///
+    /// # Errors
+    /// When the mask cannot be read or decoded, or `path` cannot be written.
+    pub fn write_mask(&self, path: &Path) -> Result<(), FormatError> {
+        let Some(mask) = &self.mask else { return Ok(()) };
+        let mut mask = decode_mask(mask, Orientation::NoTransforms)?;
+        for value in &mut mask.data {
+            *value = if *value >= MASK_THRESHOLD { 255 } else { 0 };
+        }
+        write_png(path, mask.width, mask.height, 1, &mask.data)
     }
 }
 
@@ -171,27 +186,27 @@ pub fn read_photo_folder(folder: &Path) -> Result<PhotoFolder, FormatError> {
 /// # Errors
 /// When a folder cannot be read.
 pub fn read_photo_folders(folders: &[impl AsRef<Path>]) -> Result<PhotoFolder, FormatError> {
-    let mut files: Vec<Found> = Vec::new();
-    let mut found = PhotoFolder::default();
+    let mut files: Vec<PhotoFiles> = Vec::new();
+    let mut result = PhotoFolder::default();
     for folder in folders.iter().map(AsRef::as_ref) {
-        let before = files.len();
-        let Pictures {
+        let first_new = files.len();
+        let ImageFiles {
             root,
             images,
-            files: here,
-        } = pictures_of(folder)?;
-        let beside = [
-            Beside::masks(&root, &images),
-            Beside::depths(&root),
-            Beside::normals(&root),
+            files: new_files,
+        } = find_image_files(folder)?;
+        let siblings = [
+            SiblingFolder::masks(&root, &images),
+            SiblingFolder::depths(&root),
+            SiblingFolder::normals(&root),
         ];
-        files.extend(here.into_iter().map(|path| {
+        files.extend(new_files.into_iter().map(|path| {
             let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-            let files = beside
+            let files = siblings
                 .each_ref()
-                .map(|beside| beside.as_ref().and_then(|beside| beside.of(&name)));
+                .map(|folder| folder.as_ref().and_then(|folder| folder.file_of(&name)));
             let [mask, depth, normals] = files;
-            Found {
+            PhotoFiles {
                 path,
                 name,
                 mask,
@@ -199,77 +214,81 @@ pub fn read_photo_folders(folders: &[impl AsRef<Path>]) -> Result<PhotoFolder, F
                 normals,
             }
         }));
-        let here = &files[before..];
-        if let [Some(masks), ..] = &beside
-            && !here.is_empty()
-            && here.iter().all(|file| file.mask.is_none())
+        let new_files = &files[first_new..];
+        if let [Some(masks), ..] = &siblings
+            && !new_files.is_empty()
+            && new_files.iter().all(|file| file.mask.is_none())
         {
-            let why = "none of its files has the name of a photograph, so nothing is masked";
-            found.repeated.push((masks.folder().to_owned(), why.to_owned()));
+            let reason = "none of its files has the name of a photograph, so nothing is masked";
+            result.repeated.push((masks.folder().to_owned(), reason.to_owned()));
         }
     }
-    let read: HashSet<PathBuf> = (files.iter().map(|file| &file.path))
-        .filter(|path| is_unread(path).is_none())
+    let readable: HashSet<PathBuf> = (files.iter().map(|file| &file.path))
+        .filter(|path| unsupported_extension(path).is_none())
         .map(|path| path.with_extension(""))
         .collect();
-    let is_other_form = |file: &Found| is_unread(&file.path).is_some() && read.contains(&file.path.with_extension(""));
-    let (forms, files): (Vec<Found>, Vec<Found>) = files.into_iter().partition(is_other_form);
-    let repeats = |file: Found| (file.name, "another form of a photograph that is read".to_owned());
-    found.repeated.extend(forms.into_iter().map(repeats));
-    let mut places = HashSet::new();
-    let (mut files, again): (Vec<Found>, Vec<Found>) = files.into_iter().partition(|file| {
-        let place = file.path.canonicalize().unwrap_or_else(|_| file.path.clone());
-        places.insert((place, file.name.clone()))
+    let is_duplicate = |file: &PhotoFiles| {
+        unsupported_extension(&file.path).is_some() && readable.contains(&file.path.with_extension(""))
+    };
+    let (duplicates, files): (Vec<PhotoFiles>, Vec<PhotoFiles>) = files.into_iter().partition(is_duplicate);
+    let as_duplicate = |file: PhotoFiles| (file.name, "another form of a photograph that is read".to_owned());
+    result.repeated.extend(duplicates.into_iter().map(as_duplicate));
+    let mut known_paths = HashSet::new();
+    let (mut files, repeats): (Vec<PhotoFiles>, Vec<PhotoFiles>) = files.into_iter().partition(|file| {
+        let path = file.path.canonicalize().unwrap_or_else(|_| file.path.clone());
+        known_paths.insert((path, file.name.clone()))
     });
-    let given = |file: Found| (file.name, "given twice".to_owned());
-    found.repeated.extend(again.into_iter().map(given));
-    tell_apart(&mut files);
+    let as_repeat = |file: PhotoFiles| (file.name, "given twice".to_owned());
+    result.repeated.extend(repeats.into_iter().map(as_repeat));
+    make_names_unique(&mut files);
     files.sort_by(|a, b| a.name.cmp(&b.name).then_with(|| a.path.cmp(&b.path)));
     let entries: Vec<(String, Result<PhotoEntry, String>)> = files
         .par_iter()
         .map(|file| (file.name.clone(), read_entry(file)))
         .collect();
-    let mut first_with: BTreeMap<u64, String> = BTreeMap::new();
-    let mut first_taken: HashMap<(PathBuf, String), String> = HashMap::new();
+    let mut first_by_hash: BTreeMap<u64, String> = BTreeMap::new();
+    let mut first_by_time: HashMap<(PathBuf, String), String> = HashMap::new();
     for (name, entry) in entries {
         let photo = match entry {
             Ok(photo) => photo,
             Err(reason) => {
-                found.left_out.push((name, reason));
+                result.left_out.push((name, reason));
                 continue;
             }
         };
         let time = photo.tags.time.clone();
-        let taken = time.map(|time| (photo.path.with_extension(""), time));
-        if let Some(first) = first_with.get(&photo.hash) {
-            found.repeated.push((name, format!("a copy of {first}, byte for byte")));
-        } else if let Some(first) = taken.as_ref().and_then(|taken| first_taken.get(taken)) {
-            found.repeated.push((name, format!("another form of {first}")));
-        } else if found.photos.last().is_some_and(|other| other.name == name) {
+        let time_key = time.map(|time| (photo.path.with_extension(""), time));
+        if let Some(first) = first_by_hash.get(&photo.hash) {
+            result
+                .repeated
+                .push((name, format!("a copy of {first}, byte for byte")));
+        } else if let Some(first) = time_key.as_ref().and_then(|time_key| first_by_time.get(time_key)) {
+            result.repeated.push((name, format!("another form of {first}")));
+        } else if result.photos.last().is_some_and(|other| other.name == name) {
             let reason = "another photograph has this name: rename it".to_owned();
-            found.left_out.push((name, reason));
+            result.left_out.push((name, reason));
         } else {
-            first_with.insert(photo.hash, name.clone());
-            first_taken.extend(taken.map(|taken| (taken, name)));
-            found.photos.push(photo);
+            first_by_hash.insert(photo.hash, name.clone());
+            first_by_time.extend(time_key.map(|time_key| (time_key, name)));
+            result.photos.push(photo);
         }
     }
-    Ok(found)
+    Ok(result)
 }
 
 /// Prefixes photographs of the same name with the name of their folder, and of the folders around it if these have the same name as well.
-fn tell_apart(files: &mut [Found]) {
-    let mut folders = vec![0; files.len()];
-    for _ in 0..MOST_FOLDERS {
+fn make_names_unique(files: &mut [PhotoFiles]) {
+    let mut levels = vec![0; files.len()];
+    for _ in 0..MAX_PARENT_FOLDERS {
         let mut known: HashMap<String, usize> = HashMap::new();
         for file in files.iter() {
             *known.entry(file.name.clone()).or_default() += 1;
         }
-        for (file, folders) in files.iter_mut().zip(&mut folders) {
-            let around = file.path.ancestors().nth(*folders + 1).and_then(Path::file_name);
-            if let (true, Some(folder)) = (known[&file.name] > 1, around) {
+        for (file, level) in files.iter_mut().zip(&mut levels) {
+            let folder = file.path.ancestors().nth(*level + 1).and_then(Path::file_name);
+            if let (true, Some(folder)) = (known[&file.name] > 1, folder) {
                 file.name = format!("{}_{}", folder.to_string_lossy(), file.name);
-                *folders += 1;
+                *level += 1;
             }
         }
     }
@@ -277,18 +296,18 @@ fn tell_apart(files: &mut [Found]) {
 
 /// The files in the folder `path` or its `images` whose extension is that of a supported image format; none if `path` is not a folder.
 pub fn photo_files(path: &Path) -> Vec<PathBuf> {
-    let mut files = pictures_of(path).map_or(Vec::new(), |pictures| pictures.files);
+    let mut files = find_image_files(path).map_or(Vec::new(), |images| images.files);
     files.retain(|file| is_image_name(file));
     files
 }
 
 /// Maximum number of enclosing folders by which photographs of the same name are distinguished.
-const MOST_FOLDERS: usize = 4;
+const MAX_PARENT_FOLDERS: usize = 4;
 /// Subfolders of a capture that hold photographs: at full size, or at a fraction of it as in benchmarks.
-const IMAGES: [&str; 5] = ["images", "images_1", "images_2", "images_4", "images_8"];
+const IMAGE_FOLDERS: [&str; 5] = ["images", "images_1", "images_2", "images_4", "images_8"];
 
 /// The image files of a capture.
-struct Pictures {
+struct ImageFiles {
     /// The folder that holds the masks and maps, beside `images`.
     root: PathBuf,
     /// The name of the folder of the files, `images` if they lie in `root` itself.
@@ -296,39 +315,39 @@ struct Pictures {
     files: Vec<PathBuf>,
 }
 
-/// The image files in `folder` itself, else in the first of its [`IMAGES`] that has some.
-fn pictures_of(folder: &Path) -> Result<Pictures, FormatError> {
-    let files = list_pictures(folder)?;
+/// The image files in `folder` itself, else in the first of its [`IMAGE_FOLDERS`] that has some.
+fn find_image_files(folder: &Path) -> Result<ImageFiles, FormatError> {
+    let files = list_image_files(folder)?;
     let own = folder
         .file_name()
-        .and_then(|name| IMAGES.into_iter().find(|images| name == *images));
+        .and_then(|name| IMAGE_FOLDERS.into_iter().find(|images| name == *images));
     if let (false, Some(images), Some(root)) = (files.is_empty(), own, folder.parent()) {
-        return Ok(Pictures {
+        return Ok(ImageFiles {
             root: root.to_owned(),
             images: images.to_owned(),
             files,
         });
     }
-    let mut found = Pictures {
+    let mut image_files = ImageFiles {
         root: folder.to_owned(),
-        images: IMAGES[0].to_owned(),
+        images: IMAGE_FOLDERS[0].to_owned(),
         files,
     };
-    for images in IMAGES {
+    for images in IMAGE_FOLDERS {
         let below = folder.join(images);
-        if found.files.is_empty() && below.is_dir() {
-            found = Pictures {
+        if image_files.files.is_empty() && below.is_dir() {
+            image_files = ImageFiles {
                 images: images.to_owned(),
-                files: list_pictures(&below)?,
-                ..found
+                files: list_image_files(&below)?,
+                ..image_files
             };
         }
     }
-    Ok(found)
+    Ok(image_files)
 }
 
 /// A photograph and the files that belong to it, before any of them is opened.
-struct Found {
+struct PhotoFiles {
     path: PathBuf,
     /// Its name among all photographs.
     name: String,
@@ -338,19 +357,23 @@ struct Found {
 }
 
 /// The files with an image's extension, sorted.
-fn list_pictures(folder: &Path) -> Result<Vec<PathBuf>, FormatError> {
-    list_files(folder, |path| is_image_name(path) || is_unread(path).is_some())
+fn list_image_files(folder: &Path) -> Result<Vec<PathBuf>, FormatError> {
+    list_files(folder, |path| {
+        is_image_name(path) || unsupported_extension(path).is_some()
+    })
 }
 
 /// The file's extension if it is that of an unsupported image format.
-fn is_unread(path: &Path) -> Option<&'static str> {
+fn unsupported_extension(path: &Path) -> Option<&'static str> {
     let extension = path.extension()?.to_str()?.to_ascii_lowercase();
-    UNREAD.into_iter().find(|unread| *unread == extension)
+    UNSUPPORTED_EXTENSIONS
+        .into_iter()
+        .find(|unsupported| *unsupported == extension)
 }
 
-fn read_entry(file: &Found) -> Result<PhotoEntry, String> {
+fn read_entry(file: &PhotoFiles) -> Result<PhotoEntry, String> {
     let (path, mask) = (&file.path, &file.mask);
-    if let Some(kind) = is_unread(path) {
+    if let Some(kind) = unsupported_extension(path) {
         return Err(format!("{kind} is not supported: convert it to JPEG or PNG"));
     }
     // Without the path, since the reason is shown beside the file's name.
@@ -369,8 +392,8 @@ fn read_entry(file: &Found) -> Result<PhotoEntry, String> {
     let tags = metadata
         .exif
         .map_or_else(CameraTags::default, |block| parse_camera_tags(&block, stored));
-    let (orientation, turned) = turned_as_stored(&header);
-    let up = match (turned, header.orientation) {
+    let (orientation, up_in_image) = colmap_orientation(&header);
+    let up = match (up_in_image, header.orientation) {
         (Some([right, down]), _) => Some(DVec3::new(f64::from(right), f64::from(down), 0.0)),
         (None, Orientation::NoTransforms) => metadata.xmp.and_then(|packet| parse_gimbal(&packet)),
         (None, _) => None,

@@ -1,7 +1,7 @@
 //! From the axes of another format to ours. Most formats have the axes of the Inria code, as we do; if one has others, positions,
 //! rotations and the bands of the spherical harmonics are converted.
 
-use crate::splats::rows::CHUNK;
+use crate::splats::rows::SPLATS_PER_TASK;
 use glam::{DMat3, DQuat, DVec3};
 use irradia_scene::{GaussianCloud, sh};
 use rayon::prelude::*;
@@ -96,7 +96,7 @@ impl Affine {
             return None;
         }
         let rotation = DMat3::from_cols_array_2d(&[0, 1, 2].map(|c| (self.linear.col(c) / lengths[c]).to_array()));
-        let (turn, mean_length) = (
+        let (rotation_quat, mean_length) = (
             DQuat::from_mat3(&rotation).normalize(),
             lengths.iter().sum::<f64>() / 3.0,
         );
@@ -110,14 +110,14 @@ impl Affine {
         shapes.for_each(|(quat, log_scale)| {
             let old = dquat(*quat);
             if is_similarity {
-                *quat = array(turn * old);
+                *quat = wxyz(rotation_quat * old);
                 *log_scale = log_scale.map(|scale| (f64::from(scale) + mean_length.ln()) as f32);
                 return;
             }
             let scale = DVec3::from(log_scale.map(|scale| f64::from(scale).exp()));
             let axes = self.linear * DMat3::from_quat(old) * DMat3::from_diagonal(scale);
             let (rotation, squares) = eigen(axes * axes.transpose());
-            *quat = array(DQuat::from_mat3(&rotation));
+            *quat = wxyz(DQuat::from_mat3(&rotation));
             *log_scale = squares.map(|square| (0.5 * square.max(1e-60).ln()) as f32);
         });
         rotate_harmonics(&mut cloud.sh, cloud.sh_degree, rotation);
@@ -134,7 +134,7 @@ fn dquat([w, x, y, z]: [f32; 4]) -> DQuat {
     }
 }
 
-fn array(quat: DQuat) -> [f32; 4] {
+fn wxyz(quat: DQuat) -> [f32; 4] {
     [quat.w, quat.x, quat.y, quat.z].map(|v| v as f32)
 }
 
@@ -151,13 +151,13 @@ fn eigen(mut a: DMat3) -> (DMat3, [f64; 3]) {
             let theta = (a.col(q)[q] - a.col(p)[p]) / (2.0 * off);
             let t = theta.signum() / (theta.abs() + (theta * theta + 1.0).sqrt());
             let c = 1.0 / (t * t + 1.0).sqrt();
-            let mut turn = DMat3::IDENTITY;
-            turn.col_mut(p)[p] = c;
-            turn.col_mut(q)[q] = c;
-            turn.col_mut(q)[p] = t * c;
-            turn.col_mut(p)[q] = -t * c;
-            a = turn.transpose() * a * turn;
-            vectors *= turn;
+            let mut rotation = DMat3::IDENTITY;
+            rotation.col_mut(p)[p] = c;
+            rotation.col_mut(q)[q] = c;
+            rotation.col_mut(q)[p] = t * c;
+            rotation.col_mut(p)[q] = -t * c;
+            a = rotation.transpose() * a * rotation;
+            vectors *= rotation;
         }
     }
     (vectors, [a.col(0)[0], a.col(1)[1], a.col(2)[2]])
@@ -173,15 +173,15 @@ pub(crate) fn rotate_harmonics(values: &mut [f32], degree: u32, rotation: DMat3)
     let width = sh::coefficients(degree);
     let inverse = rotation.transpose();
     let mut matrix = vec![[0.0f64; 25]; width];
-    for (direction, weight) in sphere() {
-        let (new, old) = (basis(direction), basis(inverse * direction));
+    for (direction, weight) in sphere_quadrature() {
+        let (new, old) = (sh_basis(direction), sh_basis(inverse * direction));
         for (row, new) in matrix.iter_mut().zip(new) {
             for (entry, old) in row.iter_mut().zip(old) {
                 *entry += weight * new * old;
             }
         }
     }
-    values.par_chunks_mut(CHUNK * 3 * width).for_each(|chunk| {
+    values.par_chunks_mut(SPLATS_PER_TASK * 3 * width).for_each(|chunk| {
         for sh in chunk.chunks_exact_mut(3 * width) {
             let mut old = [[0.0f64; 3]; 25];
             for (old, v) in old.iter_mut().zip(sh.chunks_exact(3)) {
@@ -201,7 +201,7 @@ pub(crate) fn rotate_harmonics(values: &mut [f32], degree: u32, rotation: DMat3)
 }
 
 /// Directions and weights that integrate polynomials up to degree 9 on the sphere exactly: Gauss-Legendre in z, equal steps around.
-fn sphere() -> impl Iterator<Item = (DVec3, f64)> {
+fn sphere_quadrature() -> impl Iterator<Item = (DVec3, f64)> {
     // Abramowitz and Stegun, table 25.4, n = 5.
     const LEGENDRE: [(f64, f64); 5] = [
         (-0.906_179_845_938_664, 0.236_926_885_056_189_1),
@@ -210,19 +210,19 @@ fn sphere() -> impl Iterator<Item = (DVec3, f64)> {
         (0.538_469_310_105_683_1, 0.478_628_670_499_366_5),
         (0.906_179_845_938_664, 0.236_926_885_056_189_1),
     ];
-    const AROUND: usize = 10;
+    const LONGITUDE_STEPS: usize = 10;
     LEGENDRE.into_iter().flat_map(|(z, weight)| {
-        (0..AROUND).map(move |step| {
-            let (sin, cos) = (step as f64 / AROUND as f64 * std::f64::consts::TAU).sin_cos();
+        (0..LONGITUDE_STEPS).map(move |step| {
+            let (sin, cos) = (step as f64 / LONGITUDE_STEPS as f64 * std::f64::consts::TAU).sin_cos();
             let radius = (1.0 - z * z).sqrt();
             let direction = DVec3::new(radius * cos, radius * sin, z);
-            (direction, weight * std::f64::consts::TAU / AROUND as f64)
+            (direction, weight * std::f64::consts::TAU / LONGITUDE_STEPS as f64)
         })
     })
 }
 
 /// The basis functions up to degree 4 at a unit direction, with the signs of the Inria code.
-fn basis(d: DVec3) -> [f64; 25] {
+fn sh_basis(d: DVec3) -> [f64; 25] {
     let DVec3 { x, y, z } = d;
     let (xx, yy, zz) = (x * x, y * y, z * z);
     let [a, b, c, e, f] = sh::C2;
@@ -284,7 +284,9 @@ mod tests {
     fn color(cloud: &GaussianCloud, i: usize, direction: DVec3) -> f64 {
         let width = cloud.sh_coefficients();
         let sh = &cloud.sh[i * 3 * width..];
-        (0..width).map(|k| f64::from(sh[3 * k + 1]) * basis(direction)[k]).sum()
+        (0..width)
+            .map(|k| f64::from(sh[3 * k + 1]) * sh_basis(direction)[k])
+            .sum()
     }
 
     fn assert_is_moved(old: &GaussianCloud, new: &GaussianCloud, map: Affine, turn: DMat3) {
@@ -304,7 +306,9 @@ mod tests {
     fn the_basis_is_orthonormal() {
         for i in 0..25 {
             for j in 0..25 {
-                let product: f64 = sphere().map(|(d, w)| w * basis(d)[i] * basis(d)[j]).sum();
+                let product: f64 = sphere_quadrature()
+                    .map(|(d, w)| w * sh_basis(d)[i] * sh_basis(d)[j])
+                    .sum();
                 assert!(
                     (product - f64::from(u8::from(i == j))).abs() < 1e-12,
                     "{i} {j}: {product}"

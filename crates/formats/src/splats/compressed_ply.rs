@@ -14,15 +14,15 @@ use rayon::prelude::*;
 use std::io::{self, Write};
 
 /// The element of the chunks' bounds, by which the format is recognised.
-pub(crate) const CHUNKS: &str = "chunk";
+pub(crate) const CHUNK_ELEMENT: &str = "chunk";
 /// Splats per chunk.
-const CHUNK: usize = 256;
+const CHUNK_SIZE: usize = 256;
 /// Coefficients above DC are from `-SH_RANGE` to `SH_RANGE`.
 const SH_RANGE: f32 = 4.0;
 /// Bounds of ln scale that other readers accept: an infinite bound would turn its whole chunk into NaNs.
 const MAX_LOG_SCALE: f32 = 20.0;
 
-const BOUNDS: [&str; 12] = [
+const BOUND_PROPERTIES: [&str; 12] = [
     "min_x",
     "min_y",
     "min_z",
@@ -36,33 +36,33 @@ const BOUNDS: [&str; 12] = [
     "max_scale_y",
     "max_scale_z",
 ];
-const COLOR_BOUNDS: [&str; 6] = ["min_r", "min_g", "min_b", "max_r", "max_g", "max_b"];
-const PACKED: [&str; 4] = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
+const COLOR_BOUND_PROPERTIES: [&str; 6] = ["min_r", "min_g", "min_b", "max_r", "max_g", "max_b"];
+const PACKED_PROPERTIES: [&str; 4] = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
 
 /// The splats of a parsed header that declares chunks.
 pub(crate) fn parse(ply: &Ply) -> Result<GaussianCloud, Malformed> {
-    let chunks = ply.rows(CHUNKS)?;
+    let chunks = ply.rows(CHUNK_ELEMENT)?;
     let vertices = ply.rows("vertex")?;
-    let bounds = chunks.columns(BOUNDS)?;
-    let color_bounds = chunks.columns(COLOR_BOUNDS).ok();
-    let [position, rotation, scale, color] = vertices.columns(PACKED)?;
+    let bounds = chunks.columns(BOUND_PROPERTIES)?;
+    let color_bounds = chunks.columns(COLOR_BOUND_PROPERTIES).ok();
+    let [position, rotation, scale, color] = vertices.columns(PACKED_PROPERTIES)?;
     let count = vertices.len();
-    if count.div_ceil(CHUNK) > chunks.len() {
+    if count.div_ceil(CHUNK_SIZE) > chunks.len() {
         return Err(Malformed(format!(
-            "{count} splats need {} chunks of {CHUNK}, and the file declares {}; the file is damaged",
-            count.div_ceil(CHUNK),
+            "{count} splats need {} chunks of {CHUNK_SIZE}, and the file declares {}; the file is damaged",
+            count.div_ceil(CHUNK_SIZE),
             chunks.len()
         )));
     }
     let harmonics = Harmonics::find(ply, count)?;
     let degree = harmonics.as_ref().map_or(0, |harmonics| harmonics.degree);
     let logits = logits_of_bytes();
-    let between = |chunk: &[u8], columns: &[Column], c: usize, t: f32| {
+    let lerp = |chunk: &[u8], columns: &[Column], c: usize, t: f32| {
         let (low, high) = (columns[c].f32(chunk), columns[c + 3].f32(chunk));
         low * (1.0 - t) + high * t
     };
     Ok(decode_splats(count, degree, |i, splat| {
-        let (row, chunk) = (vertices.row(i), chunks.row(i / CHUNK));
+        let (row, chunk) = (vertices.row(i), chunks.row(i / CHUNK_SIZE));
         let spatial = |column: Column| {
             let bits = column.u32(row);
             [
@@ -71,10 +71,10 @@ pub(crate) fn parse(ply: &Ply) -> Result<GaussianCloud, Malformed> {
                 from_unorm(bits, 11),
             ]
         };
-        let (at, size) = (spatial(position), spatial(scale));
+        let (mean_fraction, scale_fraction) = (spatial(position), spatial(scale));
         for c in 0..3 {
-            splat.mean[c] = between(chunk, &bounds[..6], c, at[c]);
-            splat.log_scale[c] = between(chunk, &bounds[6..], c, size[c]);
+            splat.mean[c] = lerp(chunk, &bounds[..6], c, mean_fraction[c]);
+            splat.log_scale[c] = lerp(chunk, &bounds[6..], c, scale_fraction[c]);
         }
         let bits = rotation.u32(row);
         let component = |shift: u32| (from_unorm(bits >> shift, 10) - 0.5) * std::f32::consts::SQRT_2;
@@ -83,7 +83,7 @@ pub(crate) fn parse(ply: &Ply) -> Result<GaussianCloud, Malformed> {
         for c in 0..3 {
             let value = f32::from(bytes[c]) / 255.0;
             splat.sh[c] = sh::dc_from_color(match &color_bounds {
-                Some(columns) => between(chunk, columns, c, value),
+                Some(columns) => lerp(chunk, columns, c, value),
                 None => value,
             });
         }
@@ -174,15 +174,15 @@ impl Range {
         })
     }
 
-    fn clamped(self, most: f32) -> Self {
+    fn clamped(self, max: f32) -> Self {
         Self {
-            low: self.low.map(|v| v.clamp(-most, most)),
-            high: self.high.map(|v| v.clamp(-most, most)),
+            low: self.low.map(|v| v.clamp(-max, max)),
+            high: self.high.map(|v| v.clamp(-max, max)),
         }
     }
 
     /// Where `value` lies between the bounds, from 0 to 1.
-    fn place(&self, value: [f32; 3]) -> [f32; 3] {
+    fn fraction_of(&self, value: [f32; 3]) -> [f32; 3] {
         std::array::from_fn(|c| {
             let extent = self.high[c] - self.low[c];
             if extent > 0.0 {
@@ -202,7 +202,7 @@ pub(crate) fn write(out: &mut dyn Write, cloud: &GaussianCloud) -> io::Result<()
     let order = morton_order(&cloud.means);
     let color = |i: u32| std::array::from_fn(|c| sh::color_from_dc(cloud.sh[i as usize * width + c]));
     let ranges: Vec<[Range; 3]> = order
-        .par_chunks(CHUNK)
+        .par_chunks(CHUNK_SIZE)
         .map(|chunk| {
             let indices = || chunk.iter().map(|i| *i as usize);
             [
@@ -219,11 +219,11 @@ pub(crate) fn write(out: &mut dyn Write, cloud: &GaussianCloud) -> io::Result<()
         "ply\nformat binary_little_endian 1.0\ncomment written by Irradia\nelement chunk {}",
         ranges.len()
     )?;
-    for name in BOUNDS.iter().chain(&COLOR_BOUNDS) {
+    for name in BOUND_PROPERTIES.iter().chain(&COLOR_BOUND_PROPERTIES) {
         writeln!(out, "property float {name}")?;
     }
     writeln!(out, "element vertex {count}")?;
-    for name in PACKED {
+    for name in PACKED_PROPERTIES {
         writeln!(out, "property uint {name}")?;
     }
     if rest > 0 {
@@ -241,17 +241,17 @@ pub(crate) fn write(out: &mut dyn Write, cloud: &GaussianCloud) -> io::Result<()
     }
     out.write_all(&encode_rows(count, 16, |at, row| {
         let i = order[at] as usize;
-        let [means, scales, colors] = &ranges[at / CHUNK];
+        let [means, scales, colors] = &ranges[at / CHUNK_SIZE];
         let spatial = |[x, y, z]: [f32; 3]| unorm(x, 11) << 21 | unorm(y, 10) << 11 | unorm(z, 11);
         let (largest, others) = smallest_three(cloud.quats[i]);
         let rotation = others.into_iter().fold(largest as u32, |bits, v| {
             bits << 10 | unorm(v * std::f32::consts::FRAC_1_SQRT_2 + 0.5, 10)
         });
-        let [r, g, b] = colors.place(color(order[at])).map(|v| unorm(v, 8) as u8);
+        let [r, g, b] = colors.fraction_of(color(order[at])).map(|v| unorm(v, 8) as u8);
         let words = [
-            spatial(means.place(cloud.means[i])),
+            spatial(means.fraction_of(cloud.means[i])),
             rotation,
-            spatial(scales.place(cloud.log_scales[i])),
+            spatial(scales.fraction_of(cloud.log_scales[i])),
             u32::from_be_bytes([r, g, b, opacity_byte(cloud.opacity_logits[i])]),
         ];
         row.copy_from_slice(words.map(u32::to_le_bytes).as_flattened());

@@ -7,27 +7,27 @@
 //! `w, x, y, z`. Coefficients are band by band, each first all of red. The axes are ours. Degree 2 is the highest that is written.
 
 use crate::Malformed;
-use crate::bytes::Bytes;
+use crate::bytes::ByteReader;
 use crate::splats::Quality;
-use crate::splats::quantize::{byte, color_byte, dc_of_byte, logits_of_bytes, normalized, opacity_byte};
+use crate::splats::quantize::{color_byte, dc_of_byte, logits_of_bytes, normalized, opacity_byte, round_to_byte};
 use crate::splats::rows::{bounds, decode_splats, encode_rows};
 use irradia_scene::half::{from_half, half};
 use irradia_scene::{GaussianCloud, sh};
 use std::collections::BTreeMap;
 use std::io::{self, Write};
 
-const HEADER: usize = 4096;
-const SECTION: usize = 1024;
+const HEADER_BYTES: usize = 4096;
+const SECTION_HEADER_BYTES: usize = 1024;
 /// Splats in a full bucket, and steps of a position from a bucket's centre to its side.
-const BUCKET: usize = 256;
-const STEPS: u32 = 32767;
+const BUCKET_SIZE: usize = 256;
+const POSITION_STEPS: u32 = 32767;
 /// Maximum side of a bucket's block.
-const MAX_BLOCK: f32 = 5.0;
+const MAX_BLOCK_SIDE: f32 = 5.0;
 /// Bound of level 2's coefficients if the header gives none.
-const DEFAULT_RANGE: f32 = 1.5;
+const DEFAULT_SH_RANGE: f32 = 1.5;
 
 /// Bytes per number of position, scale and rotation, and per coefficient.
-fn sizes(level: u16) -> (usize, usize) {
+fn value_sizes(level: u16) -> (usize, usize) {
     match level {
         0 => (4, 4),
         1 => (2, 2),
@@ -36,7 +36,7 @@ fn sizes(level: u16) -> (usize, usize) {
 }
 
 /// Where the three channels of coefficient `k` above DC are, in units of coefficients.
-fn places(k: usize) -> [usize; 3] {
+fn channel_indices(k: usize) -> [usize; 3] {
     let (first, length) = match k {
         0..3 => (0, 3),
         3..8 => (3, 5),
@@ -48,29 +48,33 @@ fn places(k: usize) -> [usize; 3] {
 /// A section's splats in the file.
 struct Section<'a> {
     /// Index of its first splat in the scene.
-    first: usize,
+    first_splat: usize,
     degree: u32,
     rows: &'a [u8],
-    row: usize,
+    row_bytes: usize,
     /// World units per step of a position; offset of zero steps from the bucket's centre.
-    unit: f32,
-    zero: f32,
+    position_step: f32,
+    position_offset: f32,
     /// Splats in all full buckets, splats per full bucket, and number of full buckets.
-    in_full: usize,
+    splats_in_full: usize,
     bucket_size: usize,
-    full: usize,
+    full_buckets: usize,
     /// Index of the first splat of each partly filled bucket, not counting splats in full ones.
-    starts: Vec<usize>,
+    partial_starts: Vec<usize>,
     /// Three floats a bucket.
     centers: &'a [u8],
 }
 
 impl Section<'_> {
     fn bucket(&self, i: usize) -> usize {
-        if i < self.in_full {
+        if i < self.splats_in_full {
             return i / self.bucket_size;
         }
-        self.full + self.starts.partition_point(|start| *start <= i - self.in_full) - 1
+        self.full_buckets
+            + self
+                .partial_starts
+                .partition_point(|start| *start <= i - self.splats_in_full)
+            - 1
     }
 
     fn center(&self, i: usize, axis: usize) -> f32 {
@@ -91,8 +95,8 @@ fn short(bytes: &[u8], index: usize) -> u16 {
 /// # Errors
 /// When its version or level is not known, or a section is larger than the file.
 pub fn parse(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
-    let mut header = Bytes::new(bytes);
-    let mut header = Bytes::new(header.take(HEADER)?);
+    let mut header = ByteReader::new(bytes);
+    let mut header = ByteReader::new(header.take(HEADER_BYTES)?);
     let (major, minor) = (header.u8()?, header.u8()?);
     if major != 0 || minor < 1 {
         return Err(Malformed(format!(
@@ -109,24 +113,24 @@ pub fn parse(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     }
     header.take(2 + 12)?;
     let [low, high] = [header.u32()?, header.u32()?].map(f32::from_bits);
-    let low = if low == 0.0 { -DEFAULT_RANGE } else { low };
-    let high = if high == 0.0 { DEFAULT_RANGE } else { high };
+    let low = if low == 0.0 { -DEFAULT_SH_RANGE } else { low };
+    let high = if high == 0.0 { DEFAULT_SH_RANGE } else { high };
 
-    let sections = parse_sections(&bytes[HEADER..], sections as usize, level)?;
-    let total: usize = sections.iter().map(|s| s.rows.len() / s.row).sum();
+    let sections = parse_sections(&bytes[HEADER_BYTES..], sections as usize, level)?;
+    let total: usize = sections.iter().map(|s| s.rows.len() / s.row_bytes).sum();
     if total != count as usize {
         return Err(Malformed(format!(
             "declares {count} splats, and its sections hold {total}; the file is damaged"
         )));
     }
     let degree = sections.iter().map(|s| s.degree).max().unwrap_or(0);
-    let (number, coefficient) = sizes(level);
+    let (number_bytes, coefficient_bytes) = value_sizes(level);
     let logits = logits_of_bytes();
     Ok(decode_splats(total, degree, |i, splat| {
-        let section = &sections[sections.partition_point(|s| s.first <= i) - 1];
-        let i = i - section.first;
-        let row = &section.rows[i * section.row..(i + 1) * section.row];
-        let (numbers, rest) = row.split_at(10 * number);
+        let section = &sections[sections.partition_point(|s| s.first_splat <= i) - 1];
+        let i = i - section.first_splat;
+        let row = &section.rows[i * section.row_bytes..(i + 1) * section.row_bytes];
+        let (numbers, rest) = row.split_at(10 * number_bytes);
         let value = |k: usize| match level {
             0 => float(numbers, k),
             _ => from_half(short(numbers, k)),
@@ -134,7 +138,10 @@ pub fn parse(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
         for c in 0..3 {
             splat.mean[c] = match level {
                 0 => float(numbers, c),
-                _ => f32::from(short(numbers, c)).mul_add(section.unit, section.zero) + section.center(i, c),
+                _ => {
+                    f32::from(short(numbers, c)).mul_add(section.position_step, section.position_offset)
+                        + section.center(i, c)
+                }
             };
             splat.log_scale[c] = value(3 + c).ln();
             splat.sh[c] = dc_of_byte(rest[c]);
@@ -146,11 +153,11 @@ pub fn parse(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
             .chunks_exact_mut(3)
             .enumerate()
         {
-            for (to, place) in to.iter_mut().zip(places(k)) {
-                *to = match coefficient {
-                    4 => float(rest, place),
-                    2 => from_half(short(rest, place)),
-                    _ => low + f32::from(rest[place]) / 255.0 * (high - low),
+            for (to, channel_index) in to.iter_mut().zip(channel_indices(k)) {
+                *to = match coefficient_bytes {
+                    4 => float(rest, channel_index),
+                    2 => from_half(short(rest, channel_index)),
+                    _ => low + f32::from(rest[channel_index]) / 255.0 * (high - low),
                 };
             }
         }
@@ -159,67 +166,71 @@ pub fn parse(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
 
 /// The sections, each with as many splats as its part of the file holds.
 fn parse_sections(bytes: &[u8], count: usize, level: u16) -> Result<Vec<Section<'_>>, Malformed> {
-    let mut body = Bytes::new(bytes);
-    let headers = body.take(count.saturating_mul(SECTION))?;
-    let (number, coefficient) = sizes(level);
+    let mut body = ByteReader::new(bytes);
+    let headers = body.take(count.saturating_mul(SECTION_HEADER_BYTES))?;
+    let (number_bytes, coefficient_bytes) = value_sizes(level);
     let mut sections = Vec::new();
-    let mut first = 0;
-    for (index, header) in headers.chunks_exact(SECTION).enumerate() {
-        let wrong = |what: String| Malformed(format!("its section {index} {what}; the file is damaged"));
-        let mut header = Bytes::new(header);
-        let [splats, room, bucket_size, buckets] = [header.u32()?, header.u32()?, header.u32()?, header.u32()?];
+    let mut first_splat = 0;
+    for (index, header) in headers.chunks_exact(SECTION_HEADER_BYTES).enumerate() {
+        let malformed = |reason: String| Malformed(format!("its section {index} {reason}; the file is damaged"));
+        let mut header = ByteReader::new(header);
+        let [splats, capacity, bucket_size, buckets] = [header.u32()?, header.u32()?, header.u32()?, header.u32()?];
         let block = f32::from_bits(header.u32()?);
         let bucket_bytes = header.u16()?;
         header.take(2)?;
         let steps = header.u32()?;
         header.take(4)?;
-        let [full, partial] = [header.u32()?, header.u32()?].map(|v| v as usize);
+        let [full_buckets, partial_buckets] = [header.u32()?, header.u32()?].map(|v| v as usize);
         let degree = u32::from(header.u16()?);
         if degree > 3 {
-            return Err(wrong(format!("declares spherical harmonics of degree {degree}")));
+            return Err(malformed(format!("declares spherical harmonics of degree {degree}")));
         }
-        if splats > room {
-            return Err(wrong(format!("declares {splats} splats in the space of {room}")));
+        if splats > capacity {
+            return Err(malformed(format!(
+                "declares {splats} splats in the space of {capacity}"
+            )));
         }
-        let row = 10 * number + 4 + 3 * (sh::coefficients(degree) - 1) * coefficient;
-        let lengths = body.take(4usize.saturating_mul(partial))?;
+        let row_bytes = 10 * number_bytes + 4 + 3 * (sh::coefficients(degree) - 1) * coefficient_bytes;
+        let lengths = body.take(4usize.saturating_mul(partial_buckets))?;
         let centers = body.take(usize::from(bucket_bytes).saturating_mul(buckets as usize))?;
-        let rows = body.take(row.saturating_mul(room as usize))?;
+        let rows = body.take(row_bytes.saturating_mul(capacity as usize))?;
         let (splats, bucket_size) = (splats as usize, bucket_size as usize);
-        let in_full = full.saturating_mul(bucket_size);
-        let mut starts = vec![0];
+        let splats_in_full = full_buckets.saturating_mul(bucket_size);
+        let mut partial_starts = vec![0];
         for length in lengths.chunks_exact(4) {
             let length = u32::from_le_bytes(length.try_into().expect("four bytes")) as usize;
-            starts.push(starts[starts.len() - 1] + length);
+            partial_starts.push(partial_starts[partial_starts.len() - 1] + length);
         }
-        let in_partial = starts.pop().unwrap_or(0);
+        let splats_in_partial = partial_starts.pop().unwrap_or(0);
         // Only compressed positions are relative to the centres.
         if level > 0 {
-            if in_full.saturating_add(in_partial) < splats {
-                return Err(wrong(format!("declares {splats} splats, and its buckets hold fewer")));
+            if splats_in_full.saturating_add(splats_in_partial) < splats {
+                return Err(malformed(format!(
+                    "declares {splats} splats, and its buckets hold fewer"
+                )));
             }
-            if bucket_bytes != 12 || (buckets as usize) < full.saturating_add(partial) {
-                return Err(wrong(format!(
+            if bucket_bytes != 12 || (buckets as usize) < full_buckets.saturating_add(partial_buckets) {
+                return Err(malformed(format!(
                     "declares {buckets} centres of {bucket_bytes} bytes for its buckets"
                 )));
             }
         }
-        let steps = if steps == 0 { STEPS } else { steps };
-        let unit = block / 2.0 / steps as f32;
+        let steps = if steps == 0 { POSITION_STEPS } else { steps };
+        let position_step = block / 2.0 / steps as f32;
         sections.push(Section {
-            first,
+            first_splat,
             degree,
-            rows: &rows[..row * splats],
-            row,
-            unit,
-            zero: -(steps as f32) * unit,
-            in_full,
+            rows: &rows[..row_bytes * splats],
+            row_bytes,
+            position_step,
+            position_offset: -(steps as f32) * position_step,
+            splats_in_full,
             bucket_size: bucket_size.max(1),
-            full,
-            starts,
+            full_buckets,
+            partial_starts,
             centers,
         });
-        first += splats;
+        first_splat += splats;
     }
     Ok(sections)
 }
@@ -233,8 +244,8 @@ pub(crate) fn write(out: &mut dyn Write, cloud: &GaussianCloud, quality: Quality
     };
     let (degree, width) = (cloud.sh_degree.min(2), 3 * cloud.sh_coefficients());
     let rest = sh::coefficients(degree) - 1;
-    let (number, coefficient) = sizes(level);
-    let row = 10 * number + 4 + 3 * rest * coefficient;
+    let (number_bytes, coefficient_bytes) = value_sizes(level);
+    let row = 10 * number_bytes + 4 + 3 * rest * coefficient_bytes;
     let buckets = match level {
         0 => Buckets::none(cloud.len()),
         _ => Buckets::of(&cloud.means),
@@ -247,32 +258,32 @@ pub(crate) fn write(out: &mut dyn Write, cloud: &GaussianCloud, quality: Quality
     let (low, high) = (low.min(-1e-3), high.max(1e-3));
 
     let count = cloud.len() as u32;
-    let mut header = vec![0; HEADER + SECTION];
-    let put = |to: &mut [u8], at: usize, word: u32| to[at..at + 4].copy_from_slice(&word.to_le_bytes());
+    let mut header = vec![0; HEADER_BYTES + SECTION_HEADER_BYTES];
+    let write_word = |to: &mut [u8], at: usize, word: u32| to[at..at + 4].copy_from_slice(&word.to_le_bytes());
     header[1] = 1;
     for (at, word) in [(4, 1), (8, 1), (12, count), (16, count), (20, level.into())] {
-        put(&mut header, at, word);
+        write_word(&mut header, at, word);
     }
-    put(&mut header, 36, low.to_bits());
-    put(&mut header, 40, high.to_bits());
-    let stored = buckets.centers.len();
-    let bucket_bytes = 4 * buckets.partial.len() + 12 * stored;
+    write_word(&mut header, 36, low.to_bits());
+    write_word(&mut header, 40, high.to_bits());
+    let bucket_count = buckets.centers.len();
+    let bucket_bytes = 4 * buckets.partial.len() + 12 * bucket_count;
     let section_bytes = u32::try_from(bucket_bytes + row * cloud.len())
         .map_err(|_| io::Error::other("a .ksplat file holds at most 4 GiB; choose another format"))?;
     for (at, word) in [
         (0, count),
         (4, count),
-        (8, BUCKET as u32),
-        (12, stored as u32),
-        (16, buckets.block.to_bits()),
+        (8, BUCKET_SIZE as u32),
+        (12, bucket_count as u32),
+        (16, buckets.block_side.to_bits()),
         (20, if level > 0 { 12 } else { 0 }),
-        (24, if level > 0 { STEPS } else { 1 }),
+        (24, if level > 0 { POSITION_STEPS } else { 1 }),
         (28, section_bytes),
-        (32, (stored - buckets.partial.len()) as u32),
+        (32, (bucket_count - buckets.partial.len()) as u32),
         (36, buckets.partial.len() as u32),
         (40, degree),
     ] {
-        put(&mut header, HEADER + at, word);
+        write_word(&mut header, HEADER_BYTES + at, word);
     }
     out.write_all(&header)?;
     for length in &buckets.partial {
@@ -281,7 +292,7 @@ pub(crate) fn write(out: &mut dyn Write, cloud: &GaussianCloud, quality: Quality
     for value in buckets.centers.as_flattened() {
         out.write_all(&value.to_le_bytes())?;
     }
-    let unit = buckets.block / 2.0 / STEPS as f32;
+    let position_step = buckets.block_side / 2.0 / POSITION_STEPS as f32;
     out.write_all(&encode_rows(cloud.len(), row, |at, row| {
         let (i, bucket) = buckets.order[at];
         let (i, bucket) = (i as usize, bucket as usize);
@@ -289,7 +300,7 @@ pub(crate) fn write(out: &mut dyn Write, cloud: &GaussianCloud, quality: Quality
             .map(f32::exp)
             .into_iter()
             .chain(normalized(cloud.quats[i]));
-        let (numbers, colors) = row.split_at_mut(10 * number);
+        let (numbers, colors) = row.split_at_mut(10 * number_bytes);
         if level == 0 {
             let values = cloud.means[i].into_iter().chain(shape);
             for (to, value) in numbers.chunks_exact_mut(4).zip(values) {
@@ -298,7 +309,7 @@ pub(crate) fn write(out: &mut dyn Write, cloud: &GaussianCloud, quality: Quality
         } else {
             let center = buckets.centers[bucket];
             let position = (0..3).map(|c| {
-                let steps = ((cloud.means[i][c] - center[c]) / unit).round() + STEPS as f32;
+                let steps = ((cloud.means[i][c] - center[c]) / position_step).round() + POSITION_STEPS as f32;
                 steps.clamp(0.0, 65535.0) as u16
             });
             for (to, value) in numbers.chunks_exact_mut(2).zip(position.chain(shape.map(half))) {
@@ -311,22 +322,22 @@ pub(crate) fn write(out: &mut dyn Write, cloud: &GaussianCloud, quality: Quality
         colors[3] = opacity_byte(cloud.opacity_logits[i]);
         let to = &mut colors[4..];
         for (k, triple) in above_dc(i).chunks_exact(3).enumerate() {
-            for (value, place) in triple.iter().zip(places(k)) {
-                let to = &mut to[place * coefficient..(place + 1) * coefficient];
-                match coefficient {
+            for (value, channel_index) in triple.iter().zip(channel_indices(k)) {
+                let to = &mut to[channel_index * coefficient_bytes..(channel_index + 1) * coefficient_bytes];
+                match coefficient_bytes {
                     4 => to.copy_from_slice(&value.to_le_bytes()),
                     2 => to.copy_from_slice(&half(*value).to_le_bytes()),
-                    _ => to[0] = byte((value - low) / (high - low) * 255.0),
+                    _ => to[0] = round_to_byte((value - low) / (high - low) * 255.0),
                 }
             }
         }
     }))
 }
 
-/// Splats grouped by blocks of space into buckets of at most [`BUCKET`]; full buckets first.
+/// Splats grouped by blocks of space into buckets of at most [`BUCKET_SIZE`]; full buckets first.
 struct Buckets {
     /// Side of a block.
-    block: f32,
+    block_side: f32,
     /// Splat and bucket, in the order of the file.
     order: Vec<(u32, u32)>,
     centers: Vec<[f32; 3]>,
@@ -337,7 +348,7 @@ struct Buckets {
 impl Buckets {
     fn none(count: usize) -> Self {
         Self {
-            block: MAX_BLOCK,
+            block_side: MAX_BLOCK_SIDE,
             order: (0..count as u32).map(|i| (i, 0)).collect(),
             centers: Vec::new(),
             partial: Vec::new(),
@@ -350,28 +361,28 @@ impl Buckets {
         let longest = extents.into_iter().fold(1e-6, f32::max);
         let volume: f32 = extents.into_iter().map(|extent| extent.max(1e-3 * longest)).product();
         // A block that would hold one bucket of evenly spread splats, and that floats can resolve.
-        let even = (volume * BUCKET as f32 / means.len().max(1) as f32).cbrt();
-        let block = even.max(1e-4 * longest).min(MAX_BLOCK);
+        let even_side = (volume * BUCKET_SIZE as f32 / means.len().max(1) as f32).cbrt();
+        let block_side = even_side.max(1e-4 * longest).min(MAX_BLOCK_SIDE);
         let mut blocks: BTreeMap<[i64; 3], Vec<u32>> = BTreeMap::new();
         for (i, mean) in means.iter().enumerate() {
-            let place = std::array::from_fn(|c| ((mean[c] - low[c]) / block) as i64);
-            blocks.entry(place).or_default().push(i as u32);
+            let block = std::array::from_fn(|c| ((mean[c] - low[c]) / block_side) as i64);
+            blocks.entry(block).or_default().push(i as u32);
         }
         let (mut full, mut partial) = (Vec::new(), Vec::new());
-        for (place, splats) in &blocks {
-            for bucket in splats.chunks(BUCKET) {
-                match bucket.len() == BUCKET {
-                    true => full.push((place, bucket)),
-                    false => partial.push((place, bucket)),
+        for (block, splats) in &blocks {
+            for bucket in splats.chunks(BUCKET_SIZE) {
+                match bucket.len() == BUCKET_SIZE {
+                    true => full.push((block, bucket)),
+                    false => partial.push((block, bucket)),
                 }
             }
         }
         let lengths = partial.iter().map(|(_, bucket)| bucket.len() as u32).collect();
         full.append(&mut partial);
-        let center = |place: &[i64; 3]| std::array::from_fn(|c| low[c] + (place[c] as f32 + 0.5) * block);
+        let center = |block: &[i64; 3]| std::array::from_fn(|c| low[c] + (block[c] as f32 + 0.5) * block_side);
         Self {
-            block,
-            centers: full.iter().map(|(place, _)| center(place)).collect(),
+            block_side,
+            centers: full.iter().map(|(block, _)| center(block)).collect(),
             order: full
                 .iter()
                 .enumerate()
@@ -388,11 +399,11 @@ mod tests {
 
     #[test]
     fn coefficients_are_band_by_band_and_red_first() {
-        assert_eq!(places(0), [0, 3, 6]);
-        assert_eq!(places(2), [2, 5, 8]);
-        assert_eq!(places(3), [9, 14, 19]);
-        assert_eq!(places(7), [13, 18, 23]);
-        assert_eq!(places(8), [24, 31, 38]);
+        assert_eq!(channel_indices(0), [0, 3, 6]);
+        assert_eq!(channel_indices(2), [2, 5, 8]);
+        assert_eq!(channel_indices(3), [9, 14, 19]);
+        assert_eq!(channel_indices(7), [13, 18, 23]);
+        assert_eq!(channel_indices(8), [24, 31, 38]);
     }
 
     #[test]
@@ -405,11 +416,11 @@ mod tests {
         seen.sort_unstable();
         assert!(seen.iter().copied().eq(0..2000));
         let full = buckets.centers.len() - buckets.partial.len();
-        assert_eq!(full * BUCKET + buckets.partial.iter().sum::<u32>() as usize, 2000);
+        assert_eq!(full * BUCKET_SIZE + buckets.partial.iter().sum::<u32>() as usize, 2000);
         for (i, bucket) in &buckets.order {
             for c in 0..3 {
                 let distance = means[*i as usize][c] - buckets.centers[*bucket as usize][c];
-                assert!(distance.abs() <= buckets.block * 0.501, "{distance}");
+                assert!(distance.abs() <= buckets.block_side * 0.501, "{distance}");
             }
         }
     }

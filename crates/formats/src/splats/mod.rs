@@ -81,7 +81,7 @@ impl SplatFormat {
             Self::Splat => ".splat",
             Self::Ksplat => ".ksplat",
             Self::Sog => ".sog",
-            Self::SogFolder => sog::META,
+            Self::SogFolder => sog::META_FILE,
             Self::Glb => ".glb",
             Self::GlbSpz => ".spz.glb",
             Self::Gltf => ".gltf",
@@ -102,7 +102,7 @@ impl SplatFormat {
             .map(|name| name.to_string_lossy().to_lowercase())
             .unwrap_or_default();
         let is_named = |format: &Self| match format {
-            Self::SogFolder => name == sog::META,
+            Self::SogFolder => name == sog::META_FILE,
             _ => name.ends_with(format.suffix()),
         };
         let named = Self::ALL.into_iter().filter(is_named);
@@ -123,7 +123,7 @@ impl SplatFormat {
                 path: path.to_owned(),
                 source,
             },
-            Ok(found) if found.is_dir() => FormatError::NoScene(path.to_owned()),
+            Ok(metadata) if metadata.is_dir() => FormatError::NoScene(path.to_owned()),
             Ok(_) => unknown,
         })
     }
@@ -220,13 +220,13 @@ pub struct SogDetail {
     /// Bits of each component of a rotation, 1 to 8.
     pub rotation_bits: u32,
     /// Entries of the codebooks of scales and colours, 2 to 256.
-    pub numbers: usize,
+    pub codebook: usize,
 }
 
 impl SogDetail {
     /// For `count` splats: the finest, except for the palette, whose size is a power of two below `count` (or `count` if that is small).
     pub fn of(quality: Quality, count: usize) -> Self {
-        let most = match quality {
+        let max_palette = match quality {
             Quality::Low => 4096,
             Quality::Normal => 16_384,
             Quality::High => 65_536,
@@ -234,11 +234,11 @@ impl SogDetail {
         Self {
             palette: match count {
                 ..=1024 => count,
-                _ => (count.next_power_of_two() / 2).min(most),
+                _ => (count.next_power_of_two() / 2).min(max_palette),
             },
             position_bits: 16,
             rotation_bits: 8,
-            numbers: 256,
+            codebook: 256,
         }
     }
 }
@@ -259,13 +259,13 @@ pub struct SplatFile {
 impl SplatFile {
     /// What the user should know about the file, one line each.
     pub fn warnings(&self) -> Vec<String> {
-        let left_out = (self.left_out > 0).then(|| left_out_line(self.left_out));
+        let left_out = (self.left_out > 0).then(|| left_out_message(self.left_out));
         let unread = (!self.unread.is_empty()).then(|| format!("properties not read: {}", self.unread.join(", ")));
         left_out.into_iter().chain(unread).collect()
     }
 }
 
-fn left_out_line(count: usize) -> String {
+fn left_out_message(count: usize) -> String {
     format!("{count} splats left out: a position, rotation, size, opacity or colour is not a number")
 }
 
@@ -294,12 +294,14 @@ pub fn read_splat_file(path: &Path) -> Result<SplatFile, FormatError> {
             parse(format, bytes)
         })?,
         SplatFormat::SogFolder => sog::read_folder(&sog_meta(path))?,
-        SplatFormat::Gltf => read_and_parse(path, |text| gltf::parse_gltf(text, &|name| read_beside(path, name)))?,
+        SplatFormat::Gltf => read_and_parse(path, |text| {
+            gltf::parse_gltf(text, &|name| read_sibling_file(path, name))
+        })?,
         // Refused before the file is read.
         SplatFormat::Npz => return Err(FormatError::malformed(path, "NumPy archives are written, not read")),
         _ => read_and_parse(path, |bytes| parse(format, bytes))?,
     };
-    let left_out = rows::leave_out_invalid(&mut cloud);
+    let left_out = rows::remove_invalid(&mut cloud);
     Ok(SplatFile {
         format,
         cloud,
@@ -318,7 +320,7 @@ fn parse(format: SplatFormat, bytes: &[u8]) -> Result<GaussianCloud, Malformed> 
         SplatFormat::Sog | SplatFormat::SogFolder => sog::parse(bytes),
         SplatFormat::Glb | SplatFormat::GlbSpz => gltf::parse_glb(bytes),
         SplatFormat::Gltf => gltf::parse_gltf(bytes, &|name| {
-            Err(Malformed(format!("needs the file {}", crate::zip::shown(name))))
+            Err(Malformed(format!("needs the file {}", crate::zip::printable(name))))
         }),
         SplatFormat::Npz => Err(Malformed("NumPy archives are written, not read".into())),
     }
@@ -330,7 +332,7 @@ fn parse(format: SplatFormat, bytes: &[u8]) -> Result<GaussianCloud, Malformed> 
 /// When the format cannot be read, or the bytes are damaged or refer to another file.
 pub fn parse_splats(format: SplatFormat, bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     let mut cloud = parse(format, bytes)?;
-    rows::leave_out_invalid(&mut cloud);
+    rows::remove_invalid(&mut cloud);
     Ok(cloud)
 }
 
@@ -345,7 +347,7 @@ pub fn encode_splats(format: SplatFormat, cloud: &GaussianCloud, options: &Write
     assert!(cloud.is_consistent(), "the columns of the cloud have unequal lengths");
     let prepared = match format.holds_all() {
         true => Cow::Borrowed(cloud),
-        false => prepared(cloud, &mut Vec::new()),
+        false => prepare_export(cloud, &mut Vec::new()),
     };
     let mut bytes = Vec::new();
     encode(format, &mut bytes, &prepared, options)?;
@@ -359,7 +361,7 @@ pub fn encode_splats(format: SplatFormat, cloud: &GaussianCloud, options: &Write
 ///
 /// # Panics
 /// When the cloud's columns have unequal lengths: a bug in the caller.
-pub fn through_format(
+pub fn round_trip(
     format: SplatFormat,
     cloud: &GaussianCloud,
     options: &WriteOptions,
@@ -378,21 +380,21 @@ pub fn through_format(
 
 /// Whether the folder `path` is a scene of SOG images; other programs have files named `meta.json`, too.
 pub fn is_sog_folder(path: &Path) -> bool {
-    let meta = path.join(sog::META);
-    let is_short = fs::metadata(&meta).is_ok_and(|file| file.is_file() && file.len() <= sog::MAX_META as u64);
+    let meta = path.join(sog::META_FILE);
+    let is_short = fs::metadata(&meta).is_ok_and(|file| file.is_file() && file.len() <= sog::MAX_META_BYTES as u64);
     is_short && fs::read(&meta).is_ok_and(|text| sog::is_meta(&text))
 }
 
 /// The `meta.json` that `path` is or contains.
 fn sog_meta(path: &Path) -> PathBuf {
     match path.is_dir() {
-        true => path.join(sog::META),
+        true => path.join(sog::META_FILE),
         false => path.to_owned(),
     }
 }
 
 /// The content of the file `name` to which the file `path` refers; it must be in the folder of `path` or below.
-fn read_beside(path: &Path, name: &str) -> Result<Vec<u8>, Malformed> {
+fn read_sibling_file(path: &Path, name: &str) -> Result<Vec<u8>, Malformed> {
     let relative = Path::new(name);
     let is_below = relative
         .components()
@@ -400,7 +402,7 @@ fn read_beside(path: &Path, name: &str) -> Result<Vec<u8>, Malformed> {
     if !is_below || name.contains([':', '\\']) {
         return Err(Malformed(format!(
             "refers to the file {}, which is not in its folder",
-            crate::zip::shown(name)
+            crate::zip::printable(name)
         )));
     }
     read_file(&path.with_file_name("").join(relative)).map_err(|error| Malformed(error.to_string()))
@@ -411,20 +413,20 @@ fn read_beside(path: &Path, name: &str) -> Result<Vec<u8>, Malformed> {
 /// # Errors
 /// When it cannot be read.
 pub fn splat_file_size(path: &Path) -> Result<u64, FormatError> {
-    let unreadable = |source| FormatError::Read {
+    let read_error = |source| FormatError::Read {
         path: path.to_owned(),
         source,
     };
     if SplatFormat::of(path)? != SplatFormat::SogFolder {
-        return Ok(fs::metadata(path).map_err(unreadable)?.len());
+        return Ok(fs::metadata(path).map_err(read_error)?.len());
     }
     let folder = sog_meta(path).with_file_name("");
     let mut total = 0;
-    for entry in fs::read_dir(folder).map_err(unreadable)? {
-        let entry = entry.map_err(unreadable)?;
-        let is_part = entry.path().extension().is_some_and(|e| e == "webp") || entry.file_name() == sog::META;
+    for entry in fs::read_dir(folder).map_err(read_error)? {
+        let entry = entry.map_err(read_error)?;
+        let is_part = entry.path().extension().is_some_and(|e| e == "webp") || entry.file_name() == sog::META_FILE;
         if is_part {
-            total += entry.metadata().map_err(unreadable)?.len();
+            total += entry.metadata().map_err(read_error)?.len();
         }
     }
     Ok(total)
@@ -458,7 +460,7 @@ pub fn write_splats_with(
     let mut notes = Vec::new();
     let cloud = match format.holds_all() {
         true => Cow::Borrowed(cloud),
-        false => prepared(cloud, &mut notes),
+        false => prepare_export(cloud, &mut notes),
     };
     if cloud.sh_degree > format.max_degree() {
         notes.push(format!(
@@ -508,7 +510,7 @@ fn encode(
 
 /// Whether the origin of the cloud's world is too far from that of the dataset for positions in `f32`: more than 200 times the median
 /// distance of the splats from it, at which the precision is a hundred-thousandth of that distance.
-fn is_far(cloud: &GaussianCloud) -> bool {
+fn exceeds_f32_precision(cloud: &GaussianCloud) -> bool {
     let world = cloud.world_from_dataset;
     if world.center == glam::DVec3::ZERO {
         return false;
@@ -519,33 +521,34 @@ fn is_far(cloud: &GaussianCloud) -> bool {
         .map(|mean| glam::Vec3::from(*mean).length())
         .filter(|distance| distance.is_finite())
         .collect();
-    let at = distances.len() / 2;
+    let middle = distances.len() / 2;
     let median = match distances.is_empty() {
         true => 0.0,
-        false => *distances.select_nth_unstable_by(at, f32::total_cmp).1,
+        false => *distances.select_nth_unstable_by(middle, f32::total_cmp).1,
     };
     world.center.length() > 200.0 * f64::from(median) / world.scale
 }
 
 /// The splats that can be drawn, in the dataset's coordinates, relative to the origin of its world if that is far away: formats other
 /// than PLY hold neither doubles nor a second coordinate system.
-fn prepared<'a>(cloud: &'a GaussianCloud, notes: &mut Vec<String>) -> Cow<'a, GaussianCloud> {
+fn prepare_export<'a>(cloud: &'a GaussianCloud, notes: &mut Vec<String>) -> Cow<'a, GaussianCloud> {
     let mut cloud = Cow::Borrowed(cloud);
     let world = cloud.world_from_dataset;
     if !world.is_identity() {
-        let is_far = is_far(&cloud);
+        let is_far = exceeds_f32_precision(&cloud);
         let origin = if is_far { glam::DVec3::ZERO } else { world.center };
-        let own = cloud.to_mut();
+        let owned = cloud.to_mut();
         let (unit, log_unit) = (1.0 / world.scale, world.scale.ln());
-        for mean in &mut own.means {
+        for mean in &mut owned.means {
             let position = glam::DVec3::from(mean.map(f64::from)) * unit + origin;
             *mean = position.as_vec3().to_array();
         }
-        own.log_scales
+        owned
+            .log_scales
             .as_flattened_mut()
             .iter_mut()
             .for_each(|v| *v = (f64::from(*v) - log_unit) as f32);
-        own.world_from_dataset = Similarity::IDENTITY;
+        owned.world_from_dataset = Similarity::IDENTITY;
         if is_far {
             let glam::DVec3 { x, y, z } = world.center;
             notes.push(format!(
@@ -554,21 +557,21 @@ fn prepared<'a>(cloud: &'a GaussianCloud, notes: &mut Vec<String>) -> Cow<'a, Ga
         }
     }
     if rows::has_invalid(&cloud) {
-        notes.push(left_out_line(rows::leave_out_invalid(cloud.to_mut())));
+        notes.push(left_out_message(rows::remove_invalid(cloud.to_mut())));
     }
     cloud
 }
 
 /// Writes a folder of SOG images, `meta.json` last.
 fn write_folder(meta: &Path, cloud: &GaussianCloud, options: &WriteOptions) -> Result<(), FormatError> {
-    let failed = |source| FormatError::Write {
+    let write_error = |source| FormatError::Write {
         path: meta.to_owned(),
         source,
     };
-    let files = sog::encode(cloud, options).map_err(failed)?;
+    let files = sog::encode(cloud, options).map_err(write_error)?;
     // Without it, an interrupted write leaves a folder that is no scene, rather than a mixture of two.
     if meta.exists() {
-        fs::remove_file(meta).map_err(failed)?;
+        fs::remove_file(meta).map_err(write_error)?;
     }
     for (name, content) in files {
         write_atomic(&meta.with_file_name(name), |out| out.write_all(&content))?;

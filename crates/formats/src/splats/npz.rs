@@ -10,11 +10,11 @@ pub(crate) fn write(out: &mut dyn Write, cloud: &GaussianCloud) -> io::Result<()
     let n = cloud.len();
     let mut archive = Writer::new(out);
     // One array at a time: together they are as large as the scene.
-    archive.file("means.npy", &npy(&[n, 3], cloud.means.as_flattened()))?;
-    archive.file("quats.npy", &npy(&[n, 4], cloud.quats.as_flattened()))?;
-    archive.file("log_scales.npy", &npy(&[n, 3], cloud.log_scales.as_flattened()))?;
-    archive.file("opacity_logits.npy", &npy(&[n], &cloud.opacity_logits))?;
-    archive.file("sh.npy", &npy(&[n, cloud.sh_coefficients(), 3], &cloud.sh))?;
+    archive.add_file("means.npy", &npy(&[n, 3], cloud.means.as_flattened()))?;
+    archive.add_file("quats.npy", &npy(&[n, 4], cloud.quats.as_flattened()))?;
+    archive.add_file("log_scales.npy", &npy(&[n, 3], cloud.log_scales.as_flattened()))?;
+    archive.add_file("opacity_logits.npy", &npy(&[n], &cloud.opacity_logits))?;
+    archive.add_file("sh.npy", &npy(&[n, cloud.sh_coefficients(), 3], &cloud.sh))?;
     archive.finish()
 }
 

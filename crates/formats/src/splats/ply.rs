@@ -9,24 +9,24 @@
 use crate::Malformed;
 use crate::ply::{Column, Ply, Rows, name_of};
 use crate::splats::compressed_ply;
-use crate::splats::rows::{CHUNK, decode_splats};
+use crate::splats::rows::{SPLATS_PER_TASK, decode_splats};
 use glam::DVec3;
 use irradia_scene::{ExtraColumn, GaussianCloud, Similarity, sh};
 use rayon::prelude::*;
 use std::io::{self, Write};
 
 /// The comment that stores [`GaussianCloud::antialiased`], for which the layout has no property.
-const ANTIALIASED: &str = "antialiased 1";
+const ANTIALIASED_COMMENT: &str = "antialiased 1";
 /// The comment that stores [`GaussianCloud::world_from_dataset`]: scale and centre.
-const WORLD: &str = "world_from_dataset";
+const WORLD_COMMENT: &str = "world_from_dataset";
 /// Highest degree supported.
 const MAX_DEGREE: u32 = 4;
 
 /// The properties of a splat file that every splat needs.
-const POSITION: [&str; 3] = ["x", "y", "z"];
-const DC: [&str; 3] = ["f_dc_0", "f_dc_1", "f_dc_2"];
-const SCALE: [&str; 3] = ["scale_0", "scale_1", "scale_2"];
-const ROTATION: [&str; 4] = ["rot_0", "rot_1", "rot_2", "rot_3"];
+const POSITION_PROPERTIES: [&str; 3] = ["x", "y", "z"];
+const DC_PROPERTIES: [&str; 3] = ["f_dc_0", "f_dc_1", "f_dc_2"];
+const SCALE_PROPERTIES: [&str; 3] = ["scale_0", "scale_1", "scale_2"];
+const ROTATION_PROPERTIES: [&str; 4] = ["rot_0", "rot_1", "rot_2", "rot_3"];
 
 /// Parses a splat PLY, compressed or not: any encoding, any order of properties, SH degree 0 to 4 by the number of `f_rest`. Other scalar
 /// properties of splats become [`GaussianCloud::extra`]; other content of the file is skipped. Floats are preserved bit for bit.
@@ -35,21 +35,21 @@ const ROTATION: [&str; 4] = ["rot_0", "rot_1", "rot_2", "rot_3"];
 /// When the header is invalid, properties are missing (all are named), or the file is shorter than the header declares.
 pub fn parse_splat_ply(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     let ply = Ply::parse(bytes)?;
-    if ply.has(compressed_ply::CHUNKS) {
+    if ply.has(compressed_ply::CHUNK_ELEMENT) {
         return compressed_ply::parse(&ply);
     }
     let sh_degree = check_properties(&ply)?;
     let rows = ply.rows("vertex")?;
     let columns = Columns::find(&rows, sh_degree)?;
 
-    let world_from_dataset = world_in(&ply)?;
-    let (local, log_scale) = (!world_from_dataset.is_identity(), world_from_dataset.scale.ln());
+    let world_from_dataset = parse_world(&ply)?;
+    let (has_world, log_scale) = (!world_from_dataset.is_identity(), world_from_dataset.scale.ln());
     let mut cloud = decode_splats(rows.len(), sh_degree, |i, splat| {
         let row = rows.row(i);
         *splat.mean = columns.position.map(|c| c.f32(row));
         *splat.quat = columns.rotation.map(|c| c.f32(row));
         *splat.log_scale = columns.scale.map(|c| c.f32(row));
-        if local {
+        if has_world {
             let position = DVec3::from(columns.position.map(|c| c.f64(row)));
             *splat.mean = world_from_dataset.apply(position).as_vec3().to_array();
             *splat.log_scale = splat.log_scale.map(|scale| (f64::from(scale) + log_scale) as f32);
@@ -59,7 +59,7 @@ pub fn parse_splat_ply(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
             *value = column.f32(row);
         }
     });
-    cloud.antialiased = ply.comments.iter().any(|comment| comment.trim() == ANTIALIASED);
+    cloud.antialiased = ply.comments.iter().any(|comment| comment.trim() == ANTIALIASED_COMMENT);
     cloud.world_from_dataset = world_from_dataset;
     cloud.extra = extra_columns(&rows);
     Ok(cloud)
@@ -87,16 +87,22 @@ fn extra_columns(rows: &Rows) -> Vec<ExtraColumn> {
 
 /// Whether a property is one of ours, among them the normals that everybody writes and nobody uses.
 fn is_known(name: &str) -> bool {
-    let known = [&POSITION[..], &DC, &SCALE, &ROTATION, &["nx", "ny", "nz", "opacity"]];
+    let known = [
+        &POSITION_PROPERTIES[..],
+        &DC_PROPERTIES,
+        &SCALE_PROPERTIES,
+        &ROTATION_PROPERTIES,
+        &["nx", "ny", "nz", "opacity"],
+    ];
     known.into_iter().flatten().any(|known| *known == name) || name.starts_with("f_rest_")
 }
 
 /// The world of the file's splats; the identity if the file does not give one.
-fn world_in(ply: &Ply) -> Result<Similarity, Malformed> {
+fn parse_world(ply: &Ply) -> Result<Similarity, Malformed> {
     let Some(numbers) = ply
         .comments
         .iter()
-        .find_map(|comment| comment.trim().strip_prefix(WORLD))
+        .find_map(|comment| comment.trim().strip_prefix(WORLD_COMMENT))
     else {
         return Ok(Similarity::IDENTITY);
     };
@@ -115,25 +121,25 @@ fn world_in(ply: &Ply) -> Result<Similarity, Malformed> {
         return Ok(world);
     }
     Err(Malformed(format!(
-        "the comment {WORLD} does not hold a positive scale and three coordinates; remove it to read the file as it is"
+        "the comment {WORLD_COMMENT} does not hold a positive scale and three coordinates; remove it to read the file as it is"
     )))
 }
 
 /// The properties of the splats that are neither ours nor kept: lists, and additional properties of a compressed file.
 pub(crate) fn unread_properties(bytes: &[u8]) -> Vec<String> {
     let Ok(ply) = Ply::parse(bytes) else { return Vec::new() };
-    let keeps = !ply.has(compressed_ply::CHUNKS);
+    let keeps_extra = !ply.has(compressed_ply::CHUNK_ELEMENT);
     let is_read = |name: &str| is_known(name) || name.starts_with("packed_");
     let properties = ply.properties("vertex").into_iter().flatten();
     properties
-        .filter(|(name, is_list)| !is_read(name) && (*is_list || !keeps))
+        .filter(|(name, is_list)| !is_read(name) && (*is_list || !keeps_extra))
         .map(|(name, _)| name.to_owned())
         .collect()
 }
 
 /// Whether a PLY has PlayCanvas's compressed layout.
 pub(crate) fn is_compressed(bytes: &[u8]) -> bool {
-    Ply::parse(bytes).is_ok_and(|ply| ply.has(compressed_ply::CHUNKS))
+    Ply::parse(bytes).is_ok_and(|ply| ply.has(compressed_ply::CHUNK_ELEMENT))
 }
 
 /// Whether a PLY contains splats rather than a point cloud, by the names of its properties.
@@ -155,7 +161,7 @@ struct Columns {
 
 impl Columns {
     fn find(rows: &Rows, sh_degree: u32) -> Result<Self, Malformed> {
-        let mut sh = rows.columns(DC)?.to_vec();
+        let mut sh = rows.columns(DC_PROPERTIES)?.to_vec();
         let rest = sh::coefficients(sh_degree) - 1;
         for coefficient in 0..rest {
             for channel in 0..3 {
@@ -164,9 +170,9 @@ impl Columns {
             }
         }
         Ok(Self {
-            position: rows.columns(POSITION)?,
-            rotation: rows.columns(ROTATION)?,
-            scale: rows.columns(SCALE)?,
+            position: rows.columns(POSITION_PROPERTIES)?,
+            rotation: rows.columns(ROTATION_PROPERTIES)?,
+            scale: rows.columns(SCALE_PROPERTIES)?,
             opacity: rows.columns(["opacity"])?[0],
             sh,
         })
@@ -176,15 +182,15 @@ impl Columns {
 /// Checks, before the body is read, that no property is missing, naming all that are; returns the SH degree.
 fn check_properties(ply: &Ply) -> Result<u32, Malformed> {
     let names: Vec<&str> = ply.property_names("vertex")?.collect();
-    let needed = POSITION
+    let needed = POSITION_PROPERTIES
         .iter()
-        .chain(&DC)
+        .chain(&DC_PROPERTIES)
         .chain(&["opacity"])
-        .chain(&SCALE)
-        .chain(&ROTATION);
+        .chain(&SCALE_PROPERTIES)
+        .chain(&ROTATION_PROPERTIES);
     let missing: Vec<&str> = needed.copied().filter(|name| !names.contains(name)).collect();
     if !missing.is_empty() {
-        let hint = if DC.iter().all(|name| missing.contains(name)) {
+        let hint = if DC_PROPERTIES.iter().all(|name| missing.contains(name)) {
             "; it is a point cloud or a mesh, not a splat scene"
         } else {
             ""
@@ -208,28 +214,34 @@ fn check_properties(ply: &Ply) -> Result<u32, Malformed> {
 /// values follow.
 pub(crate) fn write_splat_ply(out: &mut dyn Write, cloud: &GaussianCloud) -> io::Result<()> {
     let rest = cloud.sh_coefficients() - 1;
-    let mut names: Vec<String> = POSITION
+    let mut names: Vec<String> = POSITION_PROPERTIES
         .iter()
         .chain(&["nx", "ny", "nz"])
-        .chain(&DC)
+        .chain(&DC_PROPERTIES)
         .map(|n| n.to_string())
         .collect();
     names.extend((0..3 * rest).map(|i| format!("f_rest_{i}")));
-    names.extend(["opacity"].iter().chain(&SCALE).chain(&ROTATION).map(|n| n.to_string()));
+    names.extend(
+        ["opacity"]
+            .iter()
+            .chain(&SCALE_PROPERTIES)
+            .chain(&ROTATION_PROPERTIES)
+            .map(|n| n.to_string()),
+    );
 
     writeln!(out, "ply\nformat binary_little_endian 1.0\ncomment written by Irradia")?;
     if cloud.antialiased {
-        writeln!(out, "comment {ANTIALIASED}")?;
+        writeln!(out, "comment {ANTIALIASED_COMMENT}")?;
     }
     let world = cloud.world_from_dataset;
     if !world.is_identity() {
         let [x, y, z] = world.center.to_array();
-        writeln!(out, "comment {WORLD} {} {x} {y} {z}", world.scale)?;
+        writeln!(out, "comment {WORLD_COMMENT} {} {x} {y} {z}", world.scale)?;
     }
-    let doubles = super::is_far(cloud);
+    let doubles = super::exceeds_f32_precision(cloud);
     writeln!(out, "element vertex {}", cloud.len())?;
     for name in &names {
-        let scalar = if doubles && POSITION.contains(&name.as_str()) {
+        let scalar = if doubles && POSITION_PROPERTIES.contains(&name.as_str()) {
             "double"
         } else {
             "float"
@@ -244,8 +256,8 @@ pub(crate) fn write_splat_ply(out: &mut dyn Write, cloud: &GaussianCloud) -> io:
     let (sh_values, log_scale) = (3 * (rest + 1), world.scale.ln());
     let extra_bytes: usize = cloud.extra.iter().map(|column| column.scalar.size()).sum();
     let chunk_bytes = |chunk: usize| {
-        let first = chunk * CHUNK;
-        let last = (first + CHUNK).min(cloud.len());
+        let first = chunk * SPLATS_PER_TASK;
+        let last = (first + SPLATS_PER_TASK).min(cloud.len());
         let mut bytes = Vec::with_capacity((last - first) * (names.len() * 4 + 12 + extra_bytes));
         for i in first..last {
             let sh = &cloud.sh[i * sh_values..(i + 1) * sh_values];
@@ -281,7 +293,7 @@ pub(crate) fn write_splat_ply(out: &mut dyn Write, cloud: &GaussianCloud) -> io:
         bytes
     };
     // A few chunks per thread at a time: parallel, without the whole file in memory.
-    let chunks = cloud.len().div_ceil(CHUNK);
+    let chunks = cloud.len().div_ceil(SPLATS_PER_TASK);
     let batch = 2 * rayon::current_num_threads();
     for first in (0..chunks).step_by(batch) {
         let parts: Vec<Vec<u8>> = (first..(first + batch).min(chunks))
@@ -327,7 +339,7 @@ mod tests {
     #[test]
     fn every_bit_round_trips_including_nans_for_every_degree() {
         for degree in 0..=4 {
-            for count in [0, 1, 3, CHUNK + 7] {
+            for count in [0, 1, 3, SPLATS_PER_TASK + 7] {
                 let cloud = random_cloud(count, degree, degree % 2 == 0);
                 let mut bytes = Vec::new();
                 write_splat_ply(&mut bytes, &cloud).unwrap();
@@ -351,21 +363,21 @@ mod tests {
             let ply = Ply::parse(&bytes).unwrap();
             let rows = ply.rows("vertex").unwrap();
             let row = rows.row(0);
-            let position = DVec3::from(rows.columns(POSITION).unwrap().map(|column| column.f64(row)));
+            let position = DVec3::from(rows.columns(POSITION_PROPERTIES).unwrap().map(|column| column.f64(row)));
             let expected = center + DVec3::new(1500.0, -2250.0, 250.0);
             assert!((position - expected).length() < 1e-4, "{position}");
-            let scale = rows.columns(SCALE).unwrap()[0].f64(row);
+            let scale = rows.columns(SCALE_PROPERTIES).unwrap()[0].f64(row);
             assert!((scale - (1000f64.ln() - 3.0)).abs() < 1e-6);
             assert!(String::from_utf8_lossy(&bytes).contains(&format!("property {scalar} x\n")));
             assert_eq!(parse_splat_ply(&bytes).unwrap(), cloud);
         }
         let broken = b"ply\nformat ascii 1.0\ncomment world_from_dataset 0 1 2 3\nelement vertex 0\n";
-        let properties: String = POSITION
+        let properties: String = POSITION_PROPERTIES
             .iter()
-            .chain(&DC)
+            .chain(&DC_PROPERTIES)
             .chain(&["opacity"])
-            .chain(&SCALE)
-            .chain(&ROTATION)
+            .chain(&SCALE_PROPERTIES)
+            .chain(&ROTATION_PROPERTIES)
             .map(|name| format!("property float {name}\n"))
             .collect();
         let bytes = [&broken[..], properties.as_bytes(), b"end_header\n"].concat();
@@ -472,7 +484,14 @@ mod tests {
         assert_eq!(bits(&back), bits(&cloud));
         // A second column of a name, and one that does not fit a row, cannot be kept.
         let header = "ply\nformat ascii 1.0\nelement vertex 1\n";
-        let names = [&POSITION[..], &DC, &SCALE, &ROTATION, &["opacity", "label", "label"]].concat();
+        let names = [
+            &POSITION_PROPERTIES[..],
+            &DC_PROPERTIES,
+            &SCALE_PROPERTIES,
+            &ROTATION_PROPERTIES,
+            &["opacity", "label", "label"],
+        ]
+        .concat();
         let lines: String = names.iter().map(|name| format!("property float {name}\n")).collect();
         let text = format!(
             "{header}{lines}property list uchar int faces\nend_header\n{}5 6 2 7 8\n",

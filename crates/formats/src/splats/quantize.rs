@@ -3,7 +3,7 @@
 use irradia_scene::sh;
 
 /// Opacities of 0 and 1 have no finite logit; other readers use the same bound.
-const OPACITY_BOUND: f64 = 1e-6;
+const MIN_OPACITY: f64 = 1e-6;
 
 /// `1 / (1 + exp(-x))`.
 pub(crate) fn sigmoid(logit: f32) -> f32 {
@@ -12,7 +12,7 @@ pub(crate) fn sigmoid(logit: f32) -> f32 {
 
 /// The logit of an opacity; finite also for 0 and 1.
 pub(crate) fn logit(opacity: f32) -> f32 {
-    let p = f64::from(opacity).clamp(OPACITY_BOUND, 1.0 - OPACITY_BOUND);
+    let p = f64::from(opacity).clamp(MIN_OPACITY, 1.0 - MIN_OPACITY);
     (p / (1.0 - p)).ln() as f32
 }
 
@@ -23,11 +23,11 @@ pub(crate) fn logits_of_bytes() -> [f32; 256] {
 
 /// The nearest of the 256 opacities.
 pub(crate) fn opacity_byte(logit: f32) -> u8 {
-    byte(sigmoid(logit) * 255.0)
+    round_to_byte(sigmoid(logit) * 255.0)
 }
 
 /// The nearest byte, clamped to the range; 0 for NaN.
-pub(crate) fn byte(value: f32) -> u8 {
+pub(crate) fn round_to_byte(value: f32) -> u8 {
     value.round() as u8
 }
 
@@ -45,7 +45,7 @@ pub(crate) fn from_unorm(value: u32, bits: u32) -> f32 {
 
 /// The byte of a DC coefficient's colour.
 pub(crate) fn color_byte(dc: f32) -> u8 {
-    byte(sh::color_from_dc(dc) * 255.0)
+    round_to_byte(sh::color_from_dc(dc) * 255.0)
 }
 
 /// The DC coefficient of a byte's colour.
@@ -67,10 +67,10 @@ pub(crate) fn normalized(quat: [f32; 4]) -> [f32; 4] {
 pub(crate) fn smallest_three(quat: [f32; 4]) -> (usize, [f32; 3]) {
     let quat = normalized(quat);
     let largest = (1..4).fold(0, |best, c| if quat[c].abs() > quat[best].abs() { c } else { best });
-    let factor = if quat[largest] < 0.0 { -1.0 } else { 1.0 };
+    let sign = if quat[largest] < 0.0 { -1.0 } else { 1.0 };
     let mut others = [0.0; 3];
     for (to, c) in others.iter_mut().zip((0..4).filter(|c| *c != largest)) {
-        *to = quat[c] * factor;
+        *to = quat[c] * sign;
     }
     (largest, others)
 }
@@ -97,7 +97,15 @@ mod tests {
             assert_eq!(color_byte(dc_of_byte(value)), value);
         }
         assert!(logits.iter().all(|logit| logit.is_finite()));
-        assert_eq!((byte(f32::NAN), byte(-3.0), byte(1e9), byte(1.6)), (0, 0, 255, 2));
+        assert_eq!(
+            (
+                round_to_byte(f32::NAN),
+                round_to_byte(-3.0),
+                round_to_byte(1e9),
+                round_to_byte(1.6)
+            ),
+            (0, 0, 255, 2)
+        );
         for bits in [8, 10, 11] {
             for value in [0, 1, 77, (1 << bits) - 1] {
                 assert_eq!(unorm(from_unorm(value, bits), bits), value);

@@ -5,12 +5,12 @@ use irradia_scene::{GaussianCloud, sh};
 use rayon::prelude::*;
 
 /// Splats converted per task.
-pub(crate) const CHUNK: usize = 16_384;
+pub(crate) const SPLATS_PER_TASK: usize = 16_384;
 /// Maximum number of splats per byte of a compressed file; a file that declares more is damaged or designed to exhaust memory. The best
 /// known compression needs several bytes per splat.
 const MAX_SPLATS_PER_BYTE: u64 = 16;
 /// This many splats are allowed in any file.
-const ALWAYS_ALLOWED: u64 = 4096;
+const MIN_SPLAT_LIMIT: u64 = 4096;
 
 /// The parameters of one splat, to be filled in.
 pub(crate) struct SplatMut<'a> {
@@ -34,12 +34,15 @@ pub(crate) fn decode_splats(count: usize, sh_degree: u32, decode: impl Fn(usize,
         sh_degree,
         ..GaussianCloud::default()
     };
-    let geometry = cloud.means.par_chunks_mut(CHUNK).zip(cloud.quats.par_chunks_mut(CHUNK));
+    let geometry = cloud
+        .means
+        .par_chunks_mut(SPLATS_PER_TASK)
+        .zip(cloud.quats.par_chunks_mut(SPLATS_PER_TASK));
     let shape = cloud
         .log_scales
-        .par_chunks_mut(CHUNK)
-        .zip(cloud.opacity_logits.par_chunks_mut(CHUNK));
-    let colour = cloud.sh.par_chunks_mut(CHUNK * sh_values);
+        .par_chunks_mut(SPLATS_PER_TASK)
+        .zip(cloud.opacity_logits.par_chunks_mut(SPLATS_PER_TASK));
+    let colour = cloud.sh.par_chunks_mut(SPLATS_PER_TASK * sh_values);
     geometry
         .zip(shape)
         .zip(colour)
@@ -56,7 +59,7 @@ pub(crate) fn decode_splats(count: usize, sh_degree: u32, decode: impl Fn(usize,
                     opacity_logit,
                     sh,
                 };
-                decode(chunk * CHUNK + i, splat);
+                decode(chunk * SPLATS_PER_TASK + i, splat);
             }
         });
     cloud
@@ -67,11 +70,11 @@ pub(crate) fn encode_rows(count: usize, width: usize, encode: impl Fn(usize, &mu
     let mut bytes = vec![0; count * width];
     if width > 0 {
         bytes
-            .par_chunks_mut(CHUNK * width)
+            .par_chunks_mut(SPLATS_PER_TASK * width)
             .enumerate()
             .for_each(|(chunk, rows)| {
                 for (i, row) in rows.chunks_exact_mut(width).enumerate() {
-                    encode(chunk * CHUNK + i, row);
+                    encode(chunk * SPLATS_PER_TASK + i, row);
                 }
             });
     }
@@ -80,10 +83,10 @@ pub(crate) fn encode_rows(count: usize, width: usize, encode: impl Fn(usize, &mu
 
 /// The number of splats that a compressed file of `bytes` bytes declares, checked before memory is allocated for them.
 pub(crate) fn plausible_count(declared: u64, bytes: usize) -> Result<usize, Malformed> {
-    let most = (bytes as u64).saturating_mul(MAX_SPLATS_PER_BYTE).max(ALWAYS_ALLOWED);
+    let limit = (bytes as u64).saturating_mul(MAX_SPLATS_PER_BYTE).max(MIN_SPLAT_LIMIT);
     usize::try_from(declared)
         .ok()
-        .filter(|_| declared <= most)
+        .filter(|_| declared <= limit)
         .ok_or_else(|| {
             Malformed(format!(
                 "declares {declared} splats, which {bytes} bytes cannot hold; the file is damaged"
@@ -108,11 +111,11 @@ pub(crate) fn has_invalid(cloud: &GaussianCloud) -> bool {
 }
 
 /// Leaves out splats that cannot be drawn. Returns how many.
-pub(crate) fn leave_out_invalid(cloud: &mut GaussianCloud) -> usize {
+pub(crate) fn remove_invalid(cloud: &mut GaussianCloud) -> usize {
     let width = 3 * cloud.sh_coefficients();
     let valid: Vec<bool> = (0..cloud.len()).into_par_iter().map(|i| is_valid(cloud, i)).collect();
-    let left_out = valid.iter().filter(|valid| !**valid).count();
-    if left_out > 0 {
+    let removed = valid.iter().filter(|valid| !**valid).count();
+    if removed > 0 {
         let mut to = 0;
         for from in (0..valid.len()).filter(|i| valid[*i]) {
             cloud.means[to] = cloud.means[from];
@@ -132,7 +135,7 @@ pub(crate) fn leave_out_invalid(cloud: &mut GaussianCloud) -> usize {
             *column = column.gather(&kept);
         }
     }
-    left_out
+    removed
 }
 
 /// Indices of the splats along a Morton curve through their bounding box: neighbours in space become neighbours in the file, so
@@ -141,7 +144,7 @@ pub(crate) fn morton_order(means: &[[f32; 3]]) -> Vec<u32> {
     let (low, high) = bounds(means);
     let scale: [f32; 3] = std::array::from_fn(|c| 2_097_151.0 / (high[c] - low[c]).max(f32::MIN_POSITIVE));
     // 21 bits of a coordinate, each followed by two zeros.
-    let spread = |value: f32, c: usize| {
+    let interleave = |value: f32, c: usize| {
         let mut bits = ((value - low[c]) * scale[c]) as u64 & 0x1f_ffff;
         for (shift, mask) in [
             (32, 0x1f_0000_0000_ffff),
@@ -157,7 +160,7 @@ pub(crate) fn morton_order(means: &[[f32; 3]]) -> Vec<u32> {
     let mut order: Vec<(u64, u32)> = means
         .par_iter()
         .enumerate()
-        .map(|(i, mean)| ((0..3).fold(0, |code, c| code | spread(mean[c], c)), i as u32))
+        .map(|(i, mean)| ((0..3).fold(0, |code, c| code | interleave(mean[c], c)), i as u32))
         .collect();
     order.par_sort_unstable();
     order.into_iter().map(|(_, i)| i).collect()
@@ -193,11 +196,11 @@ mod tests {
         cloud.opacity_logits[4] = f32::NAN;
         cloud.sh[5 * 12 + 7] = f32::NEG_INFINITY;
         cloud.opacity_logits[6] = f32::INFINITY;
-        assert_eq!(leave_out_invalid(&mut cloud), 4);
+        assert_eq!(remove_invalid(&mut cloud), 4);
         assert!(cloud.is_consistent());
         assert_eq!(cloud.means, [[1.0; 3], [3.0; 3], [6.0; 3]]);
         assert_eq!((cloud.sh[0], cloud.sh[12], cloud.sh[35]), (1.0, 3.0, 6.0));
-        assert_eq!(leave_out_invalid(&mut cloud), 0);
+        assert_eq!(remove_invalid(&mut cloud), 0);
     }
 
     #[test]

@@ -20,7 +20,7 @@ pub struct Tensor {
 }
 
 /// Larger files are rejected; torchvision's VGG16, with its classifier, has 528 MB.
-const MAX_BYTES: u64 = 1 << 30;
+const MAX_FILE_BYTES: u64 = 1 << 30;
 
 /// The tensors of `path` whose names are `wanted`, from a safetensors file or the output of `torch.save(model.state_dict())`, as a
 /// zip archive or in the older format. Nothing in the file is executed; other objects in it are ignored.
@@ -28,14 +28,16 @@ const MAX_BYTES: u64 = 1 << 30;
 /// # Errors
 /// When the file cannot be read, is neither, or has a wanted tensor that is truncated or not in 32-bit floats.
 pub fn read_tensors(path: &Path, wanted: impl Fn(&str) -> bool) -> Result<BTreeMap<String, Tensor>, FormatError> {
-    let unreadable = |source| FormatError::Read {
+    let read_error = |source| FormatError::Read {
         path: path.to_owned(),
         source,
     };
     let mut bytes = Vec::new();
-    let file = File::open(path).map_err(unreadable)?;
-    file.take(MAX_BYTES + 1).read_to_end(&mut bytes).map_err(unreadable)?;
-    if bytes.len() as u64 > MAX_BYTES {
+    let file = File::open(path).map_err(read_error)?;
+    file.take(MAX_FILE_BYTES + 1)
+        .read_to_end(&mut bytes)
+        .map_err(read_error)?;
+    if bytes.len() as u64 > MAX_FILE_BYTES {
         return Err(FormatError::malformed(
             path,
             "larger than 1 GB: not a file of network weights",
@@ -56,12 +58,12 @@ pub(crate) fn parse(bytes: &[u8], wanted: &dyn Fn(&str) -> bool) -> Result<BTree
 }
 
 fn from_safetensors(bytes: &[u8], wanted: &dyn Fn(&str) -> bool) -> Result<BTreeMap<String, Tensor>, Malformed> {
-    let unknown = |error| {
+    let unknown_format = |error| {
         Malformed(format!(
             "neither a PyTorch state dict nor a complete safetensors file ({error})"
         ))
     };
-    let file = SafeTensors::deserialize(bytes).map_err(unknown)?;
+    let file = SafeTensors::deserialize(bytes).map_err(unknown_format)?;
     let mut tensors = BTreeMap::new();
     for (name, tensor) in file.iter().filter(|(name, _)| wanted(name)) {
         if tensor.dtype() != Dtype::F32 {

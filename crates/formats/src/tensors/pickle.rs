@@ -2,7 +2,7 @@
 //! recorded, never executed. Opcodes are those of CPython's `pickletools.py`.
 
 use crate::Malformed;
-use crate::bytes::Bytes;
+use crate::bytes::ByteReader;
 use std::collections::HashMap;
 
 /// Index of an object. Objects refer to one another by index, so that cycles and deep nesting are cheap.
@@ -31,7 +31,7 @@ pub(super) enum Object {
 pub(super) struct Pickle {
     objects: Vec<Object>,
     /// The pickled object.
-    pub(super) top: Id,
+    pub(super) root: Id,
 }
 
 /// Maximum number of objects of a pickle; VGG16's state dict has a few hundred.
@@ -84,36 +84,36 @@ impl Pickle {
 }
 
 /// Reads one pickle, to its end.
-pub(super) fn read(bytes: &mut Bytes) -> Result<Pickle, Malformed> {
-    let mut machine = Machine::default();
-    while !machine.step(bytes)? {}
-    Ok(machine.pickle)
+pub(super) fn read(bytes: &mut ByteReader) -> Result<Pickle, Malformed> {
+    let mut unpickler = Unpickler::default();
+    while !unpickler.step(bytes)? {}
+    Ok(unpickler.pickle)
 }
 
 #[derive(Default)]
-struct Machine {
+struct Unpickler {
     pickle: Pickle,
     stack: Vec<Id>,
     /// Heights of the stack at its marks.
     marks: Vec<usize>,
     memo: HashMap<u32, Id>,
     /// Objects, marks, recalls and copies so far.
-    grown: usize,
+    object_count: usize,
 }
 
-fn wrong(what: impl std::fmt::Display) -> Malformed {
-    Malformed(format!("not a usable PyTorch state dict: {what}"))
+fn malformed(reason: impl std::fmt::Display) -> Malformed {
+    Malformed(format!("not a usable PyTorch state dict: {reason}"))
 }
 
-impl Machine {
+impl Unpickler {
     /// Executes one opcode; returns whether it was the last.
-    fn step(&mut self, bytes: &mut Bytes) -> Result<bool, Malformed> {
+    fn step(&mut self, bytes: &mut ByteReader) -> Result<bool, Malformed> {
         let code = bytes.u8()?;
         match code {
             0x80 => {
                 let protocol = bytes.u8()?;
                 if protocol != 2 {
-                    return Err(wrong(format_args!("pickle protocol {protocol}, not 2")));
+                    return Err(malformed(format_args!("pickle protocol {protocol}, not 2")));
                 }
             }
             b'N' | 0x88 | 0x89 => self.push(Object::Other)?,
@@ -123,7 +123,7 @@ impl Machine {
             0x8a => {
                 let length = bytes.u8()?;
                 let digits = bytes.take(length.into())?;
-                self.push(long(digits))?;
+                self.push(parse_long(digits))?;
             }
             b'X' | b'T' => {
                 let length = bytes.u32()?;
@@ -138,14 +138,14 @@ impl Machine {
                 self.push(Object::Global(format!("{module}.{name}")))?;
             }
             b'(' => {
-                self.grow(1)?;
+                self.count_objects(1)?;
                 self.marks.push(self.stack.len());
             }
             b')' => self.push(Object::Tuple(Vec::new()))?,
             b']' => self.push(Object::List(Vec::new()))?,
             b'}' => self.push(Object::Dict(Vec::new()))?,
             b't' => {
-                let items = self.since_mark()?;
+                let items = self.pop_to_mark()?;
                 self.push(Object::Tuple(items))?;
             }
             0x85..=0x87 => {
@@ -153,7 +153,7 @@ impl Machine {
                 let at = self.stack.len().checked_sub(count);
                 let items = self
                     .stack
-                    .split_off(at.ok_or_else(|| wrong("it pops from an empty stack"))?);
+                    .split_off(at.ok_or_else(|| malformed("it pops from an empty stack"))?);
                 self.push(Object::Tuple(items))?;
             }
             b'a' => {
@@ -161,7 +161,7 @@ impl Machine {
                 self.append(&[item])?;
             }
             b'e' => {
-                let items = self.since_mark()?;
+                let items = self.pop_to_mark()?;
                 self.append(&items)?;
             }
             b's' => {
@@ -169,18 +169,18 @@ impl Machine {
                 self.set(&[key, value])?;
             }
             b'u' => {
-                let items = self.since_mark()?;
+                let items = self.pop_to_mark()?;
                 self.set(&items)?;
             }
-            b'q' => self.remember(bytes.u8()?.into())?,
+            b'q' => self.memo_put(bytes.u8()?.into())?,
             b'r' => {
                 let key = bytes.u32()?;
-                self.remember(key)?;
+                self.memo_put(key)?;
             }
-            b'h' => self.recall(bytes.u8()?.into())?,
+            b'h' => self.memo_get(bytes.u8()?.into())?,
             b'j' => {
                 let key = bytes.u32()?;
-                self.recall(key)?;
+                self.memo_get(key)?;
             }
             b'Q' => {
                 let id = self.pop()?;
@@ -188,17 +188,17 @@ impl Machine {
             }
             b'R' => {
                 let [arguments, function] = [self.pop()?, self.pop()?];
-                let made = self.call(function, arguments)?;
-                self.push(made)?;
+                let result = self.call(function, arguments)?;
+                self.push(result)?;
             }
             // Attributes of an object, such as the versions of a state dict's modules: not needed.
             b'b' => drop(self.pop()?),
             b'.' => {
-                self.pickle.top = self.pop()?;
+                self.pickle.root = self.pop()?;
                 return Ok(true);
             }
             _ => {
-                return Err(wrong(format_args!(
+                return Err(malformed(format_args!(
                     "it has pickle opcode {code:#04x}, which state dicts do not use"
                 )));
             }
@@ -216,7 +216,7 @@ impl Machine {
             Some([]) => Ok(Object::Dict(Vec::new())),
             Some([pairs]) => {
                 let pairs = *pairs;
-                self.grow(self.pickle.items(pairs).map_or(0, <[Id]>::len))?;
+                self.count_objects(self.pickle.items(pairs).map_or(0, <[Id]>::len))?;
                 let pair = |id: &Id| match self.pickle.items(*id) {
                     Some([key, value]) => Some((*key, *value)),
                     _ => None,
@@ -229,16 +229,16 @@ impl Machine {
     }
 
     /// Counts `count` more objects and checks the sum against [`MAX_OBJECTS`].
-    fn grow(&mut self, count: usize) -> Result<(), Malformed> {
-        self.grown += count;
-        if self.grown > MAX_OBJECTS {
-            return Err(wrong("it makes too many objects"));
+    fn count_objects(&mut self, count: usize) -> Result<(), Malformed> {
+        self.object_count += count;
+        if self.object_count > MAX_OBJECTS {
+            return Err(malformed("it makes too many objects"));
         }
         Ok(())
     }
 
     fn push(&mut self, object: Object) -> Result<(), Malformed> {
-        self.grow(1)?;
+        self.count_objects(1)?;
         self.stack.push(self.pickle.objects.len());
         self.pickle.objects.push(object);
         Ok(())
@@ -255,21 +255,21 @@ impl Machine {
     fn pop(&mut self) -> Result<Id, Malformed> {
         let low = self.marks.last().copied().unwrap_or(0);
         let popped = if self.stack.len() > low { self.stack.pop() } else { None };
-        popped.ok_or_else(|| wrong("it pops from an empty stack"))
+        popped.ok_or_else(|| malformed("it pops from an empty stack"))
     }
 
-    fn since_mark(&mut self) -> Result<Vec<Id>, Malformed> {
+    fn pop_to_mark(&mut self) -> Result<Vec<Id>, Malformed> {
         let mark = self
             .marks
             .pop()
-            .ok_or_else(|| wrong("it has no mark where one is needed"))?;
+            .ok_or_else(|| malformed("it has no mark where one is needed"))?;
         Ok(self.stack.split_off(mark.min(self.stack.len())))
     }
 
     fn append(&mut self, items: &[Id]) -> Result<(), Malformed> {
         match self.stack.last().map(|top| &mut self.pickle.objects[*top]) {
             Some(Object::List(list)) => list.extend(items),
-            _ => return Err(wrong("it appends to an object that is not a list")),
+            _ => return Err(malformed("it appends to an object that is not a list")),
         }
         Ok(())
     }
@@ -277,28 +277,34 @@ impl Machine {
     fn set(&mut self, items: &[Id]) -> Result<(), Malformed> {
         match self.stack.last().map(|top| &mut self.pickle.objects[*top]) {
             Some(Object::Dict(dict)) => dict.extend(items.as_chunks().0.iter().map(|[key, value]| (*key, *value))),
-            _ => return Err(wrong("it sets keys of an object that is not a dict")),
+            _ => return Err(malformed("it sets keys of an object that is not a dict")),
         }
         Ok(())
     }
 
-    fn remember(&mut self, key: u32) -> Result<(), Malformed> {
-        let top = *self.stack.last().ok_or_else(|| wrong("it memoises an empty stack"))?;
-        self.grow(1)?;
+    fn memo_put(&mut self, key: u32) -> Result<(), Malformed> {
+        let top = *self
+            .stack
+            .last()
+            .ok_or_else(|| malformed("it memoises an empty stack"))?;
+        self.count_objects(1)?;
         self.memo.insert(key, top);
         Ok(())
     }
 
-    fn recall(&mut self, key: u32) -> Result<(), Malformed> {
-        self.grow(1)?;
-        let id = self.memo.get(&key).ok_or_else(|| wrong("it recalls an unknown memo"))?;
+    fn memo_get(&mut self, key: u32) -> Result<(), Malformed> {
+        self.count_objects(1)?;
+        let id = self
+            .memo
+            .get(&key)
+            .ok_or_else(|| malformed("it recalls an unknown memo"))?;
         self.stack.push(*id);
         Ok(())
     }
 }
 
 /// Little-endian, two's complement.
-fn long(digits: &[u8]) -> Object {
+fn parse_long(digits: &[u8]) -> Object {
     if digits.len() > 8 {
         return Object::Other;
     }

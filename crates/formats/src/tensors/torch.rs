@@ -4,14 +4,14 @@
 use super::pickle::{self, Id, Object, Pickle};
 use super::{Tensor, floats};
 use crate::Malformed;
-use crate::bytes::Bytes;
+use crate::bytes::ByteReader;
 use crate::zip;
 use std::collections::{BTreeMap, HashMap};
 
 type Wanted<'a> = &'a dyn Fn(&str) -> bool;
 
-fn wrong(what: impl std::fmt::Display) -> Malformed {
-    Malformed(format!("not a usable PyTorch state dict: {what}"))
+fn malformed(reason: impl std::fmt::Display) -> Malformed {
+    Malformed(format!("not a usable PyTorch state dict: {reason}"))
 }
 
 /// From the zip archive.
@@ -21,20 +21,20 @@ pub(super) fn from_archive(bytes: &[u8], wanted: Wanted) -> Result<BTreeMap<Stri
     for (name, entry) in zip::files(bytes)? {
         let content = entry.stored();
         let content = content.ok_or_else(|| {
-            wrong(format!(
+            malformed(format!(
                 "{} is compressed, which PyTorch does not do",
-                zip::shown(&name)
+                zip::printable(&name)
             ))
         })?;
         files.insert(name, content);
     }
     let folder = files.keys().find_map(|name| name.strip_suffix("data.pkl"));
-    let folder = folder.ok_or_else(|| wrong("the archive contains no data.pkl"))?;
+    let folder = folder.ok_or_else(|| malformed("the archive contains no data.pkl"))?;
     let order = files.get(&format!("{folder}byteorder"));
     if order.is_some_and(|order| *order != b"little") {
-        return Err(wrong("its values are not little-endian"));
+        return Err(malformed("its values are not little-endian"));
     }
-    let pickle = pickle::read(&mut Bytes::new(files[&format!("{folder}data.pkl")]))?;
+    let pickle = pickle::read(&mut ByteReader::new(files[&format!("{folder}data.pkl")]))?;
     let storage = |key: &str| files.get(&format!("{folder}data/{key}")).copied();
     tensors(&pickle, bytes.len(), wanted, &storage)
 }
@@ -44,10 +44,10 @@ pub(super) fn from_stream(bytes: &[u8], wanted: Wanted) -> Result<BTreeMap<Strin
     const MAGIC: &[u8] = b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19.";
     let total = bytes.len();
     let stream = bytes.strip_prefix(MAGIC);
-    let mut bytes = Bytes::new(stream.ok_or_else(|| wrong("it does not begin like a PyTorch file"))?);
+    let mut bytes = ByteReader::new(stream.ok_or_else(|| malformed("it does not begin like a PyTorch file"))?);
     let version = pickle::read(&mut bytes)?;
-    if version.size(version.top) != Some(1001) {
-        return Err(wrong("its version is not 1001"));
+    if version.size(version.root) != Some(1001) {
+        return Err(malformed("its version is not 1001"));
     }
     pickle::read(&mut bytes)?;
     let pickle = pickle::read(&mut bytes)?;
@@ -59,12 +59,12 @@ pub(super) fn from_stream(bytes: &[u8], wanted: Wanted) -> Result<BTreeMap<Strin
         .collect();
     let mut storages = HashMap::new();
     for key in keys
-        .items(keys.top)
-        .ok_or_else(|| wrong("it has no list of storages"))?
+        .items(keys.root)
+        .ok_or_else(|| malformed("it has no list of storages"))?
     {
-        let key = keys.text(*key).ok_or_else(|| wrong("a storage has no name"))?;
+        let key = keys.text(*key).ok_or_else(|| malformed("a storage has no name"))?;
         let size = kinds.get(key).and_then(|kind| value_size(kind));
-        let size = size.ok_or_else(|| wrong(format_args!("storage {key} has an unknown type")))?;
+        let size = size.ok_or_else(|| malformed(format_args!("storage {key} has an unknown type")))?;
         let count = bytes.count(size, "values")?;
         storages.insert(key, bytes.take(count * size)?);
     }
@@ -93,7 +93,7 @@ impl<'a> Storage<'a> {
     fn of(pickle: &'a Pickle, object: &'a Object) -> Option<Self> {
         let Object::Persistent(id) = object else { return None };
         match pickle.tuple(*id)? {
-            [what, kind, key, ..] if pickle.text(*what)? == "storage" => Some(Self {
+            [tag, kind, key, ..] if pickle.text(*tag)? == "storage" => Some(Self {
                 kind: pickle.global(*kind)?,
                 key: pickle.text(*key)?,
             }),
@@ -106,14 +106,14 @@ impl<'a> Storage<'a> {
 const MAX_DIMENSIONS: usize = 8;
 
 /// A tensor as the pickle rebuilds it.
-struct Rebuilt<'a> {
+struct RebuiltTensor<'a> {
     storage: Storage<'a>,
     offset: usize,
     shape: Vec<usize>,
     strides: Vec<usize>,
 }
 
-impl<'a> Rebuilt<'a> {
+impl<'a> RebuiltTensor<'a> {
     /// `None` if the object is not a tensor.
     fn of(pickle: &'a Pickle, id: Id) -> Option<Self> {
         let call = |id: Id| match pickle.object(id) {
@@ -161,33 +161,35 @@ fn tensors<'a>(
     wanted: Wanted,
     storage: &dyn Fn(&str) -> Option<&'a [u8]>,
 ) -> Result<BTreeMap<String, Tensor>, Malformed> {
-    let Object::Dict(entries) = pickle.object(pickle.top) else {
-        return Err(wrong("it does not contain a state dict; save the model's state_dict()"));
+    let Object::Dict(entries) = pickle.object(pickle.root) else {
+        return Err(malformed(
+            "it does not contain a state dict; save the model's state_dict()",
+        ));
     };
-    let mut room = total / size_of::<f32>();
+    let mut remaining = total / size_of::<f32>();
     let mut tensors = BTreeMap::new();
     for (name, value) in entries {
         let Some(name) = pickle.text(*name).filter(|name| wanted(name)) else {
             continue;
         };
-        let of = |what: &str| wrong(format_args!("tensor {name} {what}"));
-        let tensor = Rebuilt::of(pickle, *value).ok_or_else(|| of("is of an unsupported kind"))?;
+        let tensor_error = |reason: &str| malformed(format_args!("tensor {name} {reason}"));
+        let tensor = RebuiltTensor::of(pickle, *value).ok_or_else(|| tensor_error("is of an unsupported kind"))?;
         if tensor.storage.kind != "torch.FloatStorage" {
-            return Err(of(&format!(
+            return Err(tensor_error(&format!(
                 "is in a {}; only 32-bit floats are supported",
                 tensor.storage.kind
             )));
         }
-        let count = tensor.count().ok_or_else(|| of("is not contiguous"))?;
+        let count = tensor.count().ok_or_else(|| tensor_error("is not contiguous"))?;
         let (values, _) = storage(tensor.storage.key)
-            .ok_or_else(|| of("has no values"))?
+            .ok_or_else(|| tensor_error("has no values"))?
             .as_chunks::<4>();
         let end = tensor.offset.checked_add(count);
         let values = end.and_then(|end| values.get(tensor.offset..end));
-        let values = values.ok_or_else(|| of("is larger than its storage; the file is truncated"))?;
-        room = room
+        let values = values.ok_or_else(|| tensor_error("is larger than its storage; the file is truncated"))?;
+        remaining = remaining
             .checked_sub(count)
-            .ok_or_else(|| wrong("its tensors are larger than the file"))?;
+            .ok_or_else(|| malformed("its tensors are larger than the file"))?;
         let tensor = Tensor {
             shape: tensor.shape,
             values: floats(values.as_flattened()),

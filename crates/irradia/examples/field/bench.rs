@@ -47,7 +47,7 @@ pub fn run() -> Result<()> {
             depth,
             skip: None,
         };
-        let [forward, backward] = level.run(Through { shape });
+        let [forward, backward] = level.run(NetworkThroughput { shape });
         println!(
             "{inputs} -> {depth} x {width} -> {outputs}: forward {forward:.1} GFLOP/s ({:.0} %), backward {backward:.1} ({:.0} %)",
             100.0 * forward / peak,
@@ -64,11 +64,11 @@ pub fn run() -> Result<()> {
 const ROUNDS: u32 = 5;
 
 /// GFLOP/s forward and backward through a network, 512 samples at a time.
-struct Through {
+struct NetworkThroughput {
     shape: MlpShape,
 }
 
-impl Kernel for Through {
+impl Kernel for NetworkThroughput {
     type Output = [f64; 2];
 
     #[inline(always)]

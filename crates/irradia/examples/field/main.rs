@@ -48,7 +48,7 @@ fn flag<T: std::str::FromStr>(args: &[String], name: &str, default: T) -> Result
 }
 
 /// A held-out view.
-struct Held {
+struct HeldOutView {
     camera: Camera,
     photo: Photo,
 }
@@ -65,30 +65,33 @@ fn train(args: &[String]) -> Result<()> {
         ..DatasetOptions::default()
     };
     let dataset = read_dataset(data.as_ref(), &options)?;
-    let behind = [1.0; 3];
+    let background = [1.0; 3];
     let photos: Vec<Photo> = dataset
         .train
         .iter()
         .map(|i| dataset.views[*i].photo.load())
         .collect::<Result<_, _>>()?;
-    let planes: Vec<_> = photos.iter().map(|photo| (photo.over(behind), photo.alpha())).collect();
+    let planes: Vec<_> = photos
+        .iter()
+        .map(|photo| (photo.over(background), photo.alpha()))
+        .collect();
     let views: Vec<TrainView> = (0..photos.len())
         .map(|image| TrainView {
             camera: &dataset.views[dataset.train[image]].camera,
             rgb: &planes[image].0,
             alpha: planes[image].1.as_deref(),
-            over: behind,
+            over: background,
             mask: photos[image].mask.as_deref(),
             depths: &[],
             image: image as u32,
         })
         .collect();
-    let held: Vec<Held> = dataset
+    let held: Vec<HeldOutView> = dataset
         .test
         .iter()
         .map(|i| {
             let view = &dataset.views[*i];
-            Ok(Held {
+            Ok(HeldOutView {
                 camera: view.camera,
                 photo: view.photo.load()?,
             })
@@ -122,7 +125,7 @@ fn train(args: &[String]) -> Result<()> {
         distortion: flag(args, "--distortion", 0.0)?,
         samples: flag(args, "--samples", 1 << 16)?,
         background: if args.iter().any(|a| a == "--white") {
-            Background::Fixed(behind)
+            Background::Fixed(background)
         } else {
             Background::Random
         },
@@ -154,7 +157,7 @@ fn train(args: &[String]) -> Result<()> {
                 "{spent:6.1} s CPU, step {:5}: loss {:.2} dB, {:.2} dB held out, {} rays, {:.1} samples a ray, {:.2} % occupied",
                 state.step,
                 -10.0 * smooth.log10(),
-                psnr(&state.field, &held[..held.len().min(2)], behind),
+                psnr(&state.field, &held[..held.len().min(2)], background),
                 loss.rays,
                 loss.samples as f64 / loss.rays as f64,
                 100.0 * share,
@@ -164,12 +167,12 @@ fn train(args: &[String]) -> Result<()> {
     println!(
         "{} steps, {:.2} dB held out, all views",
         state.step,
-        psnr(&state.field, &held, behind)
+        psnr(&state.field, &held, background)
     );
     let began = ProcessTime::now();
     let wall = std::time::Instant::now();
     let options = RenderOptions {
-        background: behind,
+        background,
         ..RenderOptions::default()
     };
     let view = render_view(&state.field, &held[0].camera, &options);
@@ -191,7 +194,7 @@ fn train(args: &[String]) -> Result<()> {
         began.elapsed().as_secs_f64()
     );
     if !out.is_empty() {
-        write_pictures(&PathBuf::from(out), &state.field, &held, behind)?;
+        write_pictures(&PathBuf::from(out), &state.field, &held, background)?;
     }
     Ok(())
 }
@@ -247,7 +250,7 @@ fn configure(recipe: &str, args: &[String], space: &Space) -> Result<FieldConfig
 }
 
 /// Mean over views of the PSNR against 8-bit truth.
-fn psnr(field: &Field, held: &[Held], background: [f32; 3]) -> f64 {
+fn psnr(field: &Field, held: &[HeldOutView], background: [f32; 3]) -> f64 {
     let each = held.iter().map(|view| {
         let options = RenderOptions {
             background,
@@ -266,7 +269,7 @@ fn psnr(field: &Field, held: &[Held], background: [f32; 3]) -> f64 {
     each.sum::<f64>() / held.len() as f64
 }
 
-fn write_pictures(folder: &std::path::Path, field: &Field, held: &[Held], background: [f32; 3]) -> Result<()> {
+fn write_pictures(folder: &std::path::Path, field: &Field, held: &[HeldOutView], background: [f32; 3]) -> Result<()> {
     std::fs::create_dir_all(folder)?;
     for (n, view) in held.iter().enumerate().step_by(held.len().div_ceil(4)) {
         let options = RenderOptions {

@@ -12,11 +12,11 @@ use irradia_compute::gpu::{Gpu, Wanted};
 use irradia_splat::{GpuRenderer, RenderOptions, Renderer, Splats, ViewParams};
 
 /// Bytes per second and operations (float32, fused as two) per second of an H100 SXM, by its data sheet.
-const H100: [f64; 2] = [3.35e12, 67e12];
+const H100_LIMITS: [f64; 2] = [3.35e12, 67e12];
 
 /// Splats and pixel rows of a part. Rows are whole tiles, so that the counts of parts add up; a part fits into the smallest arrays.
-const PART: usize = 500_000;
-const ROWS: u32 = 1088;
+const PART_SPLATS: usize = 500_000;
+const PART_ROWS: u32 = 1088;
 
 /// What a frame consists of.
 struct Frame {
@@ -34,7 +34,7 @@ type Stage = (&'static str, fn(&Frame) -> [f64; 2]);
 
 /// Read off the shaders in `crates/splat/src/gpu/shaders` and `crates/measure/src/gpu/shaders`; harmonics of degree 3, a photograph of 8
 /// bits, errors gathered.
-const OURS: [Stage; 9] = [
+const IRRADIA_STAGES: [Stage; 9] = [
     ("project", |f| {
         [13.0 * f.splats + 60.0 * f.visible, 250.0 * f.splats + 160.0 * f.visible]
     }),
@@ -69,7 +69,7 @@ const OURS: [Stage; 9] = [
 /// Read off gsplat's `cuda/csrc` (`ProjectionEWA3DGSFused.cu`, `SphericalHarmonicsCUDA.cu`, `IntersectTile.cu`,
 /// `RasterizeToPixels3DGSFwd.cu` and `Bwd.cu`), not packed; CUB's radix sort in passes of eight bits; PyTorch's fused Adam. Losses are
 /// not gsplat's.
-const GSPLAT: [Stage; 8] = [
+const GSPLAT_STAGES: [Stage; 8] = [
     ("projection", |f| [19.0 * f.splats, 300.0 * f.splats]),
     ("spherical harmonics", |f| [60.0 * f.splats, 160.0 * f.splats]),
     ("intersections", |f| {
@@ -113,8 +113,8 @@ pub fn run() -> Result<()> {
                 millions(frame.entries),
                 millions(frame.boxes)
             );
-            table("irradia", &OURS, &frame);
-            table("gsplat", &GSPLAT, &frame);
+            table("irradia", &IRRADIA_STAGES, &frame);
+            table("gsplat", &GSPLAT_STAGES, &frame);
         }
     }
     Ok(())
@@ -128,8 +128,8 @@ fn table(name: &str, stages: &[Stage], frame: &Frame) {
             "| {name} | {:.0} | {:.1} | {:.3} | {:.3} |",
             1e-6 * bytes,
             1e-9 * operations,
-            1e3 * bytes / H100[0],
-            1e3 * operations / H100[1]
+            1e3 * bytes / H100_LIMITS[0],
+            1e3 * operations / H100_LIMITS[1]
         );
     };
     let mut sum = [0.0; 2];
@@ -150,18 +150,18 @@ fn count(renderer: &mut GpuRenderer, splats: &Splats, [width, height]: [u32; 2])
     let tiles = [width, height].map(|side| side.div_ceil(16));
     let (mut visible, mut entries, mut boxes) = (0, 0, 0u64);
     let mut cpu = Renderer::new();
-    for first in (0..splats.len()).step_by(PART) {
-        let part: Vec<u32> = (first as u32..splats.len().min(first + PART) as u32).collect();
+    for first in (0..splats.len()).step_by(PART_SPLATS) {
+        let part: Vec<u32> = (first as u32..splats.len().min(first + PART_SPLATS) as u32).collect();
         let mut part = splats.gather(&part);
         // Harmonics do not affect the counts.
         let mut base = Planes::zeros(3, part.len());
         (0..3).for_each(|c| base.plane_mut(c).copy_from_slice(part.sh.plane(c)));
         part.sh = base;
         renderer.upload(&part, &[]);
-        for top in (0..height).step_by(ROWS as usize) {
+        for top in (0..height).step_by(PART_ROWS as usize) {
             let rows = ViewParams {
                 principal: [view.principal[0], view.principal[1] - f64::from(top)],
-                height: ROWS.min(height - top),
+                height: PART_ROWS.min(height - top),
                 ..view.clone()
             };
             renderer.render(&rows, &RenderOptions::default());

@@ -4,7 +4,7 @@ use crate::scale::{camera, scene, update};
 use anyhow::{Context, Result, bail};
 use irradia_compute::Device;
 use irradia_compute::gpu::{Gpu, Wanted};
-use irradia_measure::gpu::{Beside, DeviceFrame, GpuLoss};
+use irradia_measure::gpu::{DeviceFrame, ExtraTerms, GpuLoss};
 use irradia_measure::{LossWeights, Target, Truth};
 use irradia_splat::regularize::Regularizers;
 use irradia_splat::{DeviceGradient, Engine, RenderOptions, SplatState, Statistics, ViewParams};
@@ -14,12 +14,12 @@ use std::time::Instant;
 /// Each case is a number of splats and a size, such as `1000000@1920x1080`; without any, the cases of RESULTS.md.
 pub fn run(cases: &[String]) -> Result<()> {
     println!("{}", Device::Gpu(Gpu::open(&Wanted::Any)?));
-    let usual = [100_000, 1_000_000, 3_000_000].into_iter();
+    let default_cases = [100_000, 1_000_000, 3_000_000].into_iter();
     let cases: Vec<(usize, [u32; 2])> = match cases {
-        [] => usual
+        [] => default_cases
             .flat_map(|number| [[1920, 1080], [3840, 2160]].map(|size| (number, size)))
             .collect(),
-        cases => cases.iter().map(|case| parsed(case)).collect::<Result<_>>()?,
+        cases => cases.iter().map(|case| parse_case(case)).collect::<Result<_>>()?,
     };
     for (number, size) in cases {
         // A scene that does not fit does not end the measurement of the others.
@@ -30,7 +30,7 @@ pub fn run(cases: &[String]) -> Result<()> {
     Ok(())
 }
 
-fn parsed(case: &str) -> Result<(usize, [u32; 2])> {
+fn parse_case(case: &str) -> Result<(usize, [u32; 2])> {
     let parts = case
         .split_once('@')
         .and_then(|(number, size)| Some((number, size.split_once('x')?)));
@@ -41,13 +41,13 @@ fn parsed(case: &str) -> Result<(usize, [u32; 2])> {
 }
 
 /// Number of frames submitted before waiting for the last one.
-const MANY: u32 = 200;
+const QUEUED_FRAMES: u32 = 200;
 
 /// Writes a case for other renderers, such as `bench/peer_gsplat.py`: little endian, the numbers of splats, columns and rows (u32); as f32
 /// fx, fy, cx, cy, the 4 x 4 matrix from world to camera row by row, and the splats' means, quaternions (w first), ln of scales, logits
 /// of opacities and harmonics, 16 coefficients of three channels each.
 pub fn export(path: &str, case: &str) -> Result<()> {
-    let (number, [width, height]) = parsed(case)?;
+    let (number, [width, height]) = parse_case(case)?;
     let (splats, view) = (scene(number), ViewParams::new(&camera(width, height, 1.0)));
     let mut floats: Vec<f32> = view.focal.iter().chain(&view.principal).map(|v| *v as f32).collect();
     for (row, t) in view.rotation.iter().zip(view.translation) {
@@ -64,9 +64,9 @@ pub fn export(path: &str, case: &str) -> Result<()> {
 }
 
 /// Seconds per frame with a wait after each, per frame with a wait after many, and per step with loss, backward pass and update.
-struct Spent {
+struct Timings {
     frame: f64,
-    frame_of_many: f64,
+    queued_frame: f64,
     step: f64,
 }
 
@@ -81,8 +81,8 @@ fn measure(number: usize, [width, height]: [u32; 2]) -> Result<()> {
         engine.visible(),
         engine.intersections(),
         1e3 * spent.frame,
-        1e3 * spent.frame_of_many,
-        1.0 / spent.frame_of_many,
+        1e3 * spent.queued_frame,
+        1.0 / spent.queued_frame,
         1e3 * spent.step,
         1.0 / spent.step
     );
@@ -107,7 +107,7 @@ fn time(
     state: &SplatState,
     [width, height]: [u32; 2],
     repeats: Option<u32>,
-) -> Result<(Spent, Engine)> {
+) -> Result<(Timings, Engine)> {
     let mut engine = Engine::new(state.clone());
     engine.use_device(&Device::Gpu(gpu.clone()))?;
     let mut loss = GpuLoss::new(gpu.clone())?;
@@ -126,7 +126,7 @@ fn time(
             truth: Truth::Rgb8(&photo),
             mask: None,
         };
-        let beside = Beside {
+        let beside = ExtraTerms {
             depths: &[],
             depth_weight: 0.0,
             cover_weight: 0.03,
@@ -147,7 +147,7 @@ fn time(
         engine.update(&update);
         loss.finish();
         // If there was no room, the next step serves as the repetition.
-        let _ = engine.settle();
+        let _ = engine.finish_frame();
     };
     let each = |engine: &mut Engine, work: &mut dyn FnMut(&mut Engine)| {
         if repeats.is_none() {
@@ -163,20 +163,20 @@ fn time(
         started.elapsed().as_secs_f64() / f64::from(done)
     };
     let step = each(&mut engine, &mut step);
-    let (mut frame, mut frame_of_many) = (0.0, 0.0);
+    let (mut frame, mut queued_frame) = (0.0, 0.0);
     if repeats.is_none() {
         frame = each(&mut engine, &mut |engine| engine.render(camera.into(), &options));
         let started = Instant::now();
-        for _ in 0..MANY {
+        for _ in 0..QUEUED_FRAMES {
             engine.render_ahead(&camera, &options);
         }
         gpu.wait();
-        frame_of_many = started.elapsed().as_secs_f64() / f64::from(MANY);
-        let _ = engine.settle();
+        queued_frame = started.elapsed().as_secs_f64() / f64::from(QUEUED_FRAMES);
+        let _ = engine.finish_frame();
     }
-    let spent = Spent {
+    let spent = Timings {
         frame,
-        frame_of_many,
+        queued_frame,
         step,
     };
     Ok((spent, engine))

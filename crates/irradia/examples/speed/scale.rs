@@ -21,14 +21,14 @@ use std::sync::Arc;
 use std::time::Instant;
 
 /// Numbers a splat of degree 3 has: 11 of geometry, 48 of colour.
-const NUMBERS: f64 = 59.0;
+const NUMBERS_PER_SPLAT: f64 = 59.0;
 
 /// Operations of a splat's projection, of its colour, and of a splat-pixel pair forward and backward, counted in the source; an
 /// exponential counts as 12. They are rough, and only tell how far a stage is from the processor's peak.
-const PROJECT: f64 = 260.0;
-const COLOR: f64 = 160.0;
-const PAIR: f64 = 30.0;
-const PAIR_VJP: f64 = 62.0;
+const PROJECT_OPERATIONS: f64 = 260.0;
+const COLOR_OPERATIONS: f64 = 160.0;
+const PAIR_OPERATIONS: f64 = 30.0;
+const PAIR_VJP_OPERATIONS: f64 = 62.0;
 
 /// Measures each of `numbers` of splats at both image sizes.
 pub fn run(numbers: &[usize]) -> Result<()> {
@@ -59,7 +59,7 @@ fn line(what: &str, (wall, cpu): (f64, f64), bytes: f64, operations: f64, limits
 }
 
 /// Wall and CPU milliseconds of one call without a warm-up.
-fn once<T>(work: impl FnOnce() -> T) -> (T, (f64, f64)) {
+fn time_once<T>(work: impl FnOnce() -> T) -> (T, (f64, f64)) {
     let (wall, cpu) = (Instant::now(), ProcessTime::now());
     let made = work();
     (
@@ -70,7 +70,7 @@ fn once<T>(work: impl FnOnce() -> T) -> (T, (f64, f64)) {
 
 fn measure(number: usize, limits: &Limits) -> Result<()> {
     let splats = scene(number);
-    let state_bytes = 4.0 * number as f64 * (3.0 * NUMBERS + 6.0);
+    let state_bytes = 4.0 * number as f64 * (3.0 * NUMBERS_PER_SPLAT + 6.0);
     println!("{number} splats, a state of {:.2} GB", state_bytes / 1e9);
     let mut trainer = trainer(&splats)?;
     *trainer.engine.state_mut() = SplatState::new(splats);
@@ -118,7 +118,7 @@ fn parts(engine: &mut Engine, camera: &Camera, repeats: u32, limits: &Limits) {
     println!("  {:.0} k in view, {:.1} M pairs", seen / 1e3, pairs / 1e6);
     // Geometry of all splats and colour of those in view are read, a footprint of 64 bytes is written and read, pixels are written.
     let bytes = 4.0 * (11.0 * n + 48.0 * seen) + 128.0 * seen + 16.0 * pixels;
-    let operations = PROJECT * n + COLOR * seen + PAIR * pairs;
+    let operations = PROJECT_OPERATIONS * n + COLOR_OPERATIONS * seen + PAIR_OPERATIONS * pairs;
     line("forward", forward, bytes, operations, limits);
     let v_color = vec![1e-6; 3 * pixels as usize];
     let error = vec![0.1; pixels as usize];
@@ -127,11 +127,11 @@ fn parts(engine: &mut Engine, camera: &Camera, repeats: u32, limits: &Limits) {
         ..OutputGradient::of_color(&v_color)
     };
     let backward = time(repeats, || engine.backward(&v_out));
-    let bytes = 4.0 * seen * (2.0 * NUMBERS + 4.0) + 64.0 * seen + 12.0 * pixels;
-    let operations = 2.0 * (PROJECT + COLOR) * seen + PAIR_VJP * pairs;
+    let bytes = 4.0 * seen * (2.0 * NUMBERS_PER_SPLAT + 4.0) + 64.0 * seen + 12.0 * pixels;
+    let operations = 2.0 * (PROJECT_OPERATIONS + COLOR_OPERATIONS) * seen + PAIR_VJP_OPERATIONS * pairs;
     line("backward", backward, bytes, operations, limits);
-    let adam = |touched: f64| 4.0 * NUMBERS * 7.0 * touched;
-    let operations = 12.0 * NUMBERS;
+    let adam = |touched: f64| 4.0 * NUMBERS_PER_SPLAT * 7.0 * touched;
+    let operations = 12.0 * NUMBERS_PER_SPLAT;
     let sparse = update(false, Regularizers::default());
     let spent = time(repeats, || engine.update(&sparse));
     line("update, sparse Adam", spent, adam(seen), operations * seen, limits);
@@ -244,7 +244,7 @@ fn save(trainer: &Trainer, state_bytes: f64) -> Result<()> {
     let before = machine::resident()[0];
     machine::reset_peak();
     let (written, (wall, cpu)) =
-        once(|| irradia_formats::write_atomic(&path, |out| Checkpoint::of(trainer).write(out)));
+        time_once(|| irradia_formats::write_atomic(&path, |out| Checkpoint::of(trainer).write(out)));
     written?;
     println!(
         " checkpoint: {wall:.0} ms wall, {cpu:.0} ms CPU, {:.0} MB/s; {:.2} times the state's memory in addition",
@@ -252,11 +252,11 @@ fn save(trainer: &Trainer, state_bytes: f64) -> Result<()> {
         machine::resident()[1].saturating_sub(before) as f64 / state_bytes
     );
     let state = trainer.engine.state();
-    let (mut spare, (wall, cpu)) = once(|| SplatState::resident(state.len(), state.splats.sh_degree()));
+    let (mut spare, (wall, cpu)) = time_once(|| SplatState::resident(state.len(), state.splats.sh_degree()));
     println!(" memory for a copy, which a run obtains beside its steps: {wall:.0} ms wall, {cpu:.0} ms CPU");
     for what in ["first copy", "another copy"] {
         let copy = || Checkpoint::of(trainer).copied_into(std::mem::take(&mut spare));
-        let (copied, (wall, cpu)) = once(copy);
+        let (copied, (wall, cpu)) = time_once(copy);
         spare = copied.into_state();
         println!(" {what} for a checkpoint in the background: {wall:.0} ms wall, {cpu:.0} ms CPU");
     }
@@ -279,7 +279,7 @@ fn density(engine: &mut Engine, state_bytes: f64, step: f64, limits: &Limits) {
     };
     let before = machine::resident()[0];
     machine::reset_peak();
-    let (change, spent) = once(|| fast::densify(engine.state_mut(), &options));
+    let (change, spent) = time_once(|| fast::densify(engine.state_mut(), &options));
     let peak = machine::resident()[1].saturating_sub(before) as f64;
     line("density round", spent, 2.0 * state_bytes, 0.0, limits);
     println!(

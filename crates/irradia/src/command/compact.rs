@@ -2,8 +2,8 @@
 
 use super::convert::QualityArg;
 use super::share::parse_size;
-use super::{DataArgs, by_option, note_lines, size_line, thread_count, use_threads};
-use crate::terminal::{note, say};
+use super::{DataArgs, note_lines, size_line, thread_count, use_threads, with_option_names};
+use crate::terminal::{note, print_line};
 use anyhow::Result;
 use irradia_runs::formats::WriteOptions;
 use irradia_runs::{CompactEvent, CompactInput, CompactTarget, Compacted, compact};
@@ -58,7 +58,7 @@ pub fn run(args: &Args) -> Result<()> {
         target: args.target,
         keep_psnr: args.keep_psnr,
         steps: args.steps,
-        reading: args.reading.reading(),
+        reading: args.reading.options(),
         write: WriteOptions {
             quality: args.quality.into(),
             ..WriteOptions::default()
@@ -81,8 +81,8 @@ pub fn run(args: &Args) -> Result<()> {
             ));
         }
     })
-    .map_err(by_option)?;
-    say(format_args!("{}:{}", args.out.display(), lines(&compacted)))
+    .map_err(with_option_names)?;
+    print_line(format_args!("{}:{}", args.out.display(), lines(&compacted)))
 }
 
 /// Figures before and after, one line each.

@@ -4,17 +4,17 @@
 //! affect other runs.
 
 use super::train::parse_seconds;
-use super::{DataArgs, by_option, thread_count};
+use super::{DataArgs, thread_count, with_option_names};
 use crate::Usage;
 use crate::interrupt::stop_flag;
-use crate::terminal::{note, one_line, say};
+use crate::terminal::{note, one_line, print_line};
 use anyhow::{Context, Result, bail};
 use clap::builder::RangedU64ValueParser;
 use image::codecs::jpeg::JpegEncoder;
 use irradia_runs::formats::write_atomic;
 use irradia_runs::train::compare::{
-    Comparison, Figures, PictureRow, Published, Render, Run, Scene, flattered, overall, picture, published, to_html,
-    to_markdown, to_text,
+    Comparison, Figures, PictureRow, Published, Render, Run, Scene, lpips_bias_notes, overall, picture, published,
+    to_html, to_markdown, to_text,
 };
 use irradia_runs::train::report::{Report, ViewReport, machine};
 use irradia_runs::{
@@ -145,10 +145,10 @@ struct Source {
     notes: Vec<String>,
 }
 
-const REQUEST: &str = "request.json";
+const REQUEST_FILE: &str = "request.json";
 
 /// A run with its report.
-struct Trained {
+struct TrainedRun {
     run: Run,
     report: Option<Report>,
 }
@@ -165,7 +165,7 @@ pub fn run(args: &Args) -> Result<()> {
         return Err(Usage(format!("{} does not exist; name a dataset folder", data.display())).into());
     }
     if let Some(device) = &args.device {
-        open_device(device).map_err(by_option)?;
+        open_device(device).map_err(with_option_names)?;
     }
     let sources = sources(args)?;
     let program = program_fingerprint().context("cannot read this program's file")?;
@@ -181,7 +181,7 @@ pub fn run(args: &Args) -> Result<()> {
     let (mut device, mut done) = (String::new(), 0);
     for source in &sources {
         let name = &source.name;
-        let mut trained: Vec<Vec<Trained>> = variants.iter().map(|_| Vec::new()).collect();
+        let mut trained: Vec<Vec<TrainedRun>> = variants.iter().map(|_| Vec::new()).collect();
         // Seeds in the outer loop, so that other load on the machine affects all recipes alike.
         for seed in 0..args.seeds {
             for (variant, trained) in variants.iter().zip(&mut trained) {
@@ -216,7 +216,7 @@ pub fn run(args: &Args) -> Result<()> {
                     error,
                     figures,
                 };
-                trained.push(Trained { run, report });
+                trained.push(TrainedRun { run, report });
             }
             if stop.load(Ordering::Relaxed) {
                 break;
@@ -242,7 +242,7 @@ pub fn run(args: &Args) -> Result<()> {
         }
     }
     let mut notes: Vec<String> = sources.iter().flat_map(|source| source.notes.clone()).collect();
-    notes.extend(flattered(&scenes));
+    notes.extend(lpips_bias_notes(&scenes));
     let comparison = Comparison {
         notes,
         published: sources.into_iter().flat_map(|source| source.published).collect(),
@@ -255,7 +255,7 @@ pub fn run(args: &Args) -> Result<()> {
     };
     write(args, &comparison)?;
     if stop.load(Ordering::Relaxed) {
-        say("stopped; run the same command to continue after the finished runs")?;
+        print_line("stopped; run the same command to continue after the finished runs")?;
     } else if done == 0 {
         bail!("no run was completed; see the .log files in {}", args.out.display());
     }
@@ -278,7 +278,7 @@ fn sources(args: &Args) -> Result<Vec<Source>> {
             },
             None => args.reading.training(args.device.as_deref()),
         };
-        reading.check().map_err(by_option)?;
+        reading.check().map_err(with_option_names)?;
         let dataset = reading.read(data).ok();
         if dataset.as_ref().is_some_and(|dataset| dataset.test.is_empty()) {
             let message = format!(
@@ -400,7 +400,7 @@ fn finished(folder: &Path) -> Option<(Report, Option<Request>)> {
     let (run, record) = RunFolder::open(folder).ok()?;
     let read = |name: &str| fs::read_to_string(run.file(name)).ok();
     let report = serde_json::from_str(&read("report.json")?).ok()?;
-    let request = read(REQUEST).and_then(|text| serde_json::from_str(&text).ok());
+    let request = read(REQUEST_FILE).and_then(|text| serde_json::from_str(&text).ok());
     record.complete.then_some((report, request))
 }
 
@@ -441,7 +441,7 @@ fn one_run(request: Request, folder: &Path, what: &str, stop: &AtomicBool) -> Re
     note(format_args!("{what} .."));
     fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
     let bytes = serde_json::to_vec_pretty(&request)?;
-    write_atomic(&folder.join(REQUEST), |out| out.write_all(&bytes))?;
+    write_atomic(&folder.join(REQUEST_FILE), |out| out.write_all(&bytes))?;
     let log = folder.with_extension("log");
     let output = File::create(&log).with_context(|| format!("cannot write {}", log.display()))?;
     let program = std::env::current_exe().context("cannot find this program's own file")?;
@@ -475,8 +475,8 @@ fn one_run(request: Request, folder: &Path, what: &str, stop: &AtomicBool) -> Re
     if stop.load(Ordering::Relaxed) {
         return Ok(Outcome::Stopped);
     }
-    let said = fs::read_to_string(&log).unwrap_or_default();
-    let error = said.lines().rev().find_map(|line| line.strip_prefix("error: "));
+    let log_text = fs::read_to_string(&log).unwrap_or_default();
+    let error = log_text.lines().rev().find_map(|line| line.strip_prefix("error: "));
     Ok(Outcome::Failed(error.map_or_else(
         || format!("the run ended early ({status}); see {}", log.display()),
         str::to_owned,
@@ -484,8 +484,8 @@ fn one_run(request: Request, folder: &Path, what: &str, stop: &AtomicBool) -> Re
 }
 
 /// The held-out view of median PSNR in the first finished run, with the renderings of the first finished run of each recipe.
-fn held_out_view(out: &Path, trained: &[Vec<Trained>]) -> Option<PictureRow> {
-    let first = |runs: &'_ Vec<Trained>| runs.iter().position(|t| t.report.is_some());
+fn held_out_view(out: &Path, trained: &[Vec<TrainedRun>]) -> Option<PictureRow> {
+    let first = |runs: &'_ Vec<TrainedRun>| runs.iter().position(|t| t.report.is_some());
     let firsts: Vec<Option<(&Run, &Report)>> = trained
         .iter()
         .map(|runs| first(runs).and_then(|i| Some((&runs[i].run, runs[i].report.as_ref()?))))
@@ -515,10 +515,10 @@ fn held_out_view(out: &Path, trained: &[Vec<Trained>]) -> Option<PictureRow> {
 
 /// An image file as a `data:` URL: a JPEG of good quality, no larger than the page shows it.
 fn embed(path: &Path) -> Result<String> {
-    const LARGEST: u32 = 1200;
+    const MAX_SIDE: u32 = 1200;
     let mut shown = image::open(path).with_context(|| format!("cannot read {}", path.display()))?;
-    if shown.width().max(shown.height()) > LARGEST {
-        shown = shown.resize(LARGEST, LARGEST, image::imageops::FilterType::Triangle);
+    if shown.width().max(shown.height()) > MAX_SIDE {
+        shown = shown.resize(MAX_SIDE, MAX_SIDE, image::imageops::FilterType::Triangle);
     }
     let mut bytes = Vec::new();
     shown
@@ -563,8 +563,8 @@ fn write(args: &Args, comparison: &Comparison) -> Result<()> {
     for (name, bytes) in &files {
         write_atomic(&args.out.join(name), |out| out.write_all(bytes))?;
     }
-    say(to_text(comparison).trim_end())?;
-    say(format_args!("see {}", args.out.join("compare.html").display()))
+    print_line(to_text(comparison).trim_end())?;
+    print_line(format_args!("see {}", args.out.join("compare.html").display()))
 }
 
 #[cfg(test)]

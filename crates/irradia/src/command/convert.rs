@@ -2,7 +2,7 @@
 
 use super::{note_lines, share, size_line};
 use crate::Usage;
-use crate::terminal::say;
+use crate::terminal::print_line;
 use anyhow::Result;
 use irradia_runs::formats::{Quality, SpzVersion, WriteOptions};
 use irradia_runs::{Conversion, Level, convert as convert_scene, level_file, write_levels};
@@ -72,7 +72,7 @@ pub fn convert(args: &ConvertArgs) -> Result<()> {
         sog: None,
     };
     let conversion = convert_scene(&args.input, &args.output, &options, !args.no_compare)?;
-    say(format_args!(
+    print_line(format_args!(
         "{}: {} splats{}",
         args.output.display(),
         conversion.splats,
@@ -80,7 +80,7 @@ pub fn convert(args: &ConvertArgs) -> Result<()> {
     ))?;
     if args.lod {
         for (level, made) in (1..).zip(write_levels(&args.input, &args.output, &options)?) {
-            say(level_lines(level, &made))?;
+            print_line(level_lines(level, &made))?;
         }
     }
     Ok(())

@@ -3,7 +3,7 @@
 use super::lpips::{lpips_path, unseen_lpips_path};
 use super::render::parse_size;
 use super::{thread_count, train, use_threads};
-use crate::terminal::{note, say};
+use crate::terminal::{note, print_line};
 use anyhow::Result;
 use irradia_runs::synth::{SceneName, SynthLens, SynthOptions};
 use irradia_runs::{TrainInput, write_synth_dataset};
@@ -79,7 +79,7 @@ pub fn run(args: &Args) -> Result<()> {
         ..TrainInput::new(data, out.clone())
     };
     train::begin(input, None)?;
-    say(format_args!(
+    print_line(format_args!(
         "the scene is {}; render an orbit of it with: irradia render {} --orbit 60 --out frames",
         out.join("scene.ply").display(),
         out.display()
@@ -97,5 +97,5 @@ pub fn synth(args: &SynthArgs) -> Result<()> {
         turn: args.turn.to_radians(),
     };
     let summary = write_synth_dataset(&args.out, &options)?;
-    say(format_args!("{}: {summary}", args.out.display()))
+    print_line(format_args!("{}: {summary}", args.out.display()))
 }

@@ -1,21 +1,21 @@
 //! `irradia devices`
 
-use crate::terminal::say;
+use crate::terminal::print_line;
 use anyhow::Result;
 
 /// Lists what `--device` can name.
 pub fn run() -> Result<()> {
     let gpus = gpus();
     for gpu in &gpus {
-        say(gpu)?;
+        print_line(gpu)?;
     }
     let threads = rayon::current_num_threads();
     let level = irradia_compute::Level::detect().name();
-    say(format_args!("cpu: {threads} threads, {level}"))?;
+    print_line(format_args!("cpu: {threads} threads, {level}"))?;
     if cfg!(not(feature = "gpu")) {
-        say(irradia_compute::DeviceError::NotBuilt)?;
+        print_line(irradia_compute::DeviceError::NotBuilt)?;
     } else if gpus.is_empty() {
-        say(
+        print_line(
             "no GPU found: its driver must provide Vulkan, Metal or DX12; Mesa has a software Vulkan (mesa-vulkan-drivers)",
         )?;
     }

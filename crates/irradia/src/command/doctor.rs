@@ -1,8 +1,8 @@
 //! `irradia doctor`
 
-use super::pose::{tell_findings, with_progress};
-use super::{by_option, thread_count, use_threads};
-use crate::terminal::say;
+use super::pose::{print_findings, with_progress};
+use super::{thread_count, use_threads, with_option_names};
+use crate::terminal::print_line;
 use anyhow::Result;
 use clap::builder::RangedU64ValueParser;
 use irradia_runs::{DoctorInput, doctor};
@@ -32,13 +32,13 @@ pub fn run(args: &Args) -> Result<()> {
         out: args.out.clone(),
         max_features: args.max_features,
     };
-    let report = with_progress(|progress| doctor(&input, progress)).map_err(by_option)?;
-    tell_findings(&report.findings, |line| say(line))?;
+    let report = with_progress(|progress| doctor(&input, progress)).map_err(with_option_names)?;
+    print_findings(&report.findings, |line| print_line(line))?;
     let page = args
         .out
         .as_ref()
         .map(|out| format!("; see {}", out.join("doctor.html").display()));
-    say(format_args!(
+    print_line(format_args!(
         "{} photographs, {} in {:.1} s{}",
         report.photos,
         match report.findings.len() {

@@ -3,11 +3,11 @@
 use super::convert::QualityArg;
 use super::{note_lines, thread_count, use_threads, warn};
 use crate::Usage;
-use crate::terminal::{note, say};
+use crate::terminal::{note, print_line};
 use anyhow::{Context, Result};
 use irradia_edit::{Edit, EditList, Shape};
 use irradia_runs::formats::{WriteOptions, write_atomic};
-use irradia_runs::{Editing, Made};
+use irradia_runs::{AppliedEdit, Editing};
 use std::path::PathBuf;
 
 #[derive(clap::Args)]
@@ -111,15 +111,15 @@ pub fn run(args: &Args) -> Result<()> {
         None => "preview".to_owned(),
     };
     let shown = editing.draft().len() - editing.draft().hidden.count();
-    let edits: String = editing.made().iter().map(line).collect();
+    let edits: String = editing.applied().iter().map(line).collect();
     let notes = note_lines(&notes);
-    say(format_args!("{title}: {shown} splats{edits}{notes}"))
+    print_line(format_args!("{title}: {shown} splats{edits}{notes}"))
 }
 
 /// The summary line of an edit, with everything that was found automatically.
-fn line(made: &Made) -> String {
-    let [selected, of] = made.selected;
-    let edit = made.edit.to_string();
+fn line(applied: &AppliedEdit) -> String {
+    let [selected, of] = applied.selected;
+    let edit = applied.edit.to_string();
     // Lists of points are long.
     let short: String = match edit.char_indices().nth(100) {
         Some((end, _)) => format!("{} ..", &edit[..end]),

@@ -1,17 +1,17 @@
 //! `irradia eval`
 
 use super::lpips::{lpips, unseen_lpips};
-use super::{DataArgs, Split, rendering_device, thread_count, use_threads, warn};
+use super::{DataArgs, Split, rendering_device, thread_count, use_threads, warn, with_option_names};
 use crate::Usage;
-use crate::terminal::{note, say};
-use anyhow::{Context, Result};
+use crate::terminal::{note, print_line};
+use anyhow::{Result, ensure};
 use irradia_measure::{Evaluation, Lpips, LpipsNet, Networks};
 use irradia_runs::formats::write_atomic;
 use irradia_runs::train::eval::{EvalOptions, EvaluatedView, Metrics};
 use irradia_runs::train::half_fit::HalfFit;
 use irradia_runs::{
-    Background, HOW_TO_GET_LPIPS, RunFolder, Scene, evaluate, file_stems, read_vignette, scene_of, unmeasured,
-    write_image,
+    Background, HOW_TO_GET_LPIPS, RunFolder, Scene, evaluate, file_stems, leave_out_unreadable, read_vignette,
+    scene_path, unmeasured, write_image,
 };
 use serde_json::json;
 use std::path::{Path, PathBuf};
@@ -29,7 +29,7 @@ pub struct Args {
     pub split: Split,
     /// Fit these to the left half of each view, and also measure its right half
     #[arg(long, value_enum, value_delimiter = ',', value_name = "WHAT")]
-    pub half_fit: Vec<HalfFitOf>,
+    pub half_fit: Vec<HalfFitArg>,
     /// Write the figures to this file
     #[arg(long, value_name = "FILE")]
     pub json: Option<PathBuf>,
@@ -58,7 +58,7 @@ pub struct Args {
 
 /// Parameters that can be fitted to a held-out view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-pub enum HalfFitOf {
+pub enum HalfFitArg {
     /// An affine colour map.
     Exposure,
     /// The camera's pose.
@@ -68,8 +68,8 @@ pub enum HalfFitOf {
 impl Args {
     fn half_fit(&self) -> HalfFit {
         HalfFit {
-            exposure: self.half_fit.contains(&HalfFitOf::Exposure),
-            pose: self.half_fit.contains(&HalfFitOf::Pose),
+            exposure: self.half_fit.contains(&HalfFitArg::Exposure),
+            pose: self.half_fit.contains(&HalfFitArg::Pose),
         }
     }
 }
@@ -78,42 +78,23 @@ pub fn run(args: &Args) -> Result<()> {
     use_threads(args.threads)?;
     let mut scene = Scene::read(&args.scene)?;
     warn(&scene.notes);
-    let run = RunFolder::around(&args.scene);
-    let mut reading = args.reading.clone();
-    if reading.holdout.is_none() {
-        reading.holdout = run.as_ref().and_then(|record| record.input.reading.holdout.clone());
-    }
-    if reading.lenses.is_none() {
-        reading.lenses = run.as_ref().map(|record| record.input.reading.lenses);
-    }
-    if reading.readout.is_none() {
-        reading.readout = run.as_ref().and_then(|record| record.input.reading.readout.clone());
-    }
-    if let (Some(record), (None, None, false)) = (&run, (reading.downscale, reading.max_side, reading.full_size)) {
-        let of_run = &record.input.reading;
-        reading.max_side = of_run.max_side;
-        reading.downscale = Some(of_run.downscale).filter(|factor| *factor > 1.0);
-        reading.full_size = reading.max_side.is_none() && reading.downscale.is_none();
-    }
-    let mut dataset = reading.read(&args.data)?;
-    if let (None, Some(folder)) = (&args.reading.holdout, RunFolder::containing(&args.scene)) {
-        // The run was trained on all others.
-        let known = dataset.warnings.len();
-        folder.hold_out_again(&mut dataset)?;
-        warn(&dataset.warnings[known..]);
-    }
-    let dataset = scene.place(dataset);
-    let background = match (args.background, &run) {
-        (None, None) if !has_background(&args.scene) => Background::usual(&dataset, false)?,
+    let dataset = args.reading.options().read_for(&args.scene, &args.data);
+    let dataset = scene.place(dataset.map_err(with_option_names)?);
+    warn(&dataset.warnings);
+    let background = match (args.background, RunFolder::record_containing(&args.scene)) {
+        (None, None) if !has_background(&args.scene) => Background::default_for(&dataset, false)?,
         (given, _) => given,
     };
     if let Some(background) = background {
         scene.options.background = background.color();
     }
-    let indices = args.split.of(&dataset);
+    let mut indices = args.split.of(&dataset);
     if indices.is_empty() {
         return Err(Usage(format!("{} has no such views; try --split all", args.data.display())).into());
     }
+    let unreadable = leave_out_unreadable(&dataset, &mut indices);
+    ensure!(!indices.is_empty(), unreadable.unwrap_or_default());
+    warn(unreadable.as_slice());
     let lpips = lpips(args.lpips.as_ref(), args.lpips_net)?;
     if lpips.is_none() {
         note(format_args!(
@@ -125,7 +106,7 @@ pub fn run(args: &Args) -> Result<()> {
         _ => None,
     };
     let device = rendering_device(&args.device)?;
-    let vignette = read_vignette(&scene_of(&args.scene))?;
+    let vignette = read_vignette(&scene_path(&args.scene))?;
     let nets = [&lpips, &unseen].map(|lpips| lpips.as_ref().map(Lpips::net));
     let options = EvalOptions {
         render: scene.options,
@@ -140,33 +121,32 @@ pub fn run(args: &Args) -> Result<()> {
     let (mut rows, mut measured) = (Vec::new(), Vec::new());
     let stems = file_stems(dataset.views.iter().map(|view| view.name.as_str()));
     let mut stems = indices.iter().map(|i| &stems[*i]);
-    let see = |view: &EvaluatedView| -> Result<()> {
+    let report_view = |view: &EvaluatedView| -> Result<()> {
         let m = view.metrics;
         let stem = stems.next().expect("one per view");
         measured.push((view.name.clone(), view.is_measured()));
         if view.is_measured() {
-            say(figures(&view.name, &m, nets))?;
+            print_line(figures(&view.name, &m, nets))?;
             rows.push(json!({
                 "name": view.name, "psnr": m.psnr, "psnr_corrected": m.psnr_corrected, "ssim": m.ssim, "lpips": m.lpips, "unseen_lpips": m.unseen_lpips,
                 "half_fit_psnr": m.half_fit_psnr,
             }));
         }
         if let Some(folder) = &args.save_images {
-            std::fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
             write_image(folder.join(format!("{}.png", stem)), &view.render)?;
         }
         Ok(())
     };
-    let mean = evaluate(&scene.model, &dataset, &indices, &options, see)?;
+    let mean = evaluate(&scene.model, &dataset, &indices, &options, report_view)?;
     let unmeasured = unmeasured(measured.iter().map(|(name, measured)| (name.as_str(), *measured)));
     if rows.is_empty() {
         return Err(Usage(unmeasured.unwrap_or_default()).into());
     }
     warn(unmeasured.as_slice());
-    say(figures(&format!("mean of {}", rows.len()), &mean, nets))?;
+    print_line(figures(&format!("mean of {}", rows.len()), &mean, nets))?;
     if let Some(path) = &args.json {
         let figures = json!({
-            "scene": scene_of(&args.scene).to_string_lossy(), "data": args.data.to_string_lossy(),
+            "scene": scene_path(&args.scene).to_string_lossy(), "data": args.data.to_string_lossy(),
             "splats": scene.model.splats().map(|splats| splats.len()),
             "parameters": scene.model.field().map(|field| field.len()),
             "psnr": mean.psnr, "psnr_corrected": mean.psnr_corrected, "ssim": mean.ssim, "lpips": mean.lpips, "lpips_net": nets[0].map(LpipsNet::name),
@@ -181,7 +161,7 @@ pub fn run(args: &Args) -> Result<()> {
 
 /// Whether there is a recipe beside `scene`, as in the folder of an edited run, which gives its background.
 fn has_background(scene: &Path) -> bool {
-    scene_of(scene).with_file_name("recipe.toml").is_file()
+    scene_path(scene).with_file_name("recipe.toml").is_file()
 }
 
 /// One line of figures.

@@ -1,6 +1,6 @@
 //! `irradia info`
 
-use crate::terminal::say;
+use crate::terminal::print_line;
 use anyhow::Result;
 use irradia_runs::describe;
 use std::path::PathBuf;
@@ -12,5 +12,5 @@ pub struct InfoArgs {
 }
 
 pub fn info(args: &InfoArgs) -> Result<()> {
-    say(describe(&args.path)?)
+    print_line(describe(&args.path)?)
 }

@@ -1,16 +1,16 @@
 //! Finds LPIPS weights, and `irradia lpips`, which imports them.
 
 use crate::Usage;
-use crate::terminal::{note, say};
+use crate::terminal::{note, print_line};
 use anyhow::{Context, Result, anyhow};
 use irradia_measure::{ImportedTensor, Lpips, LpipsNet, to_weights_file};
-use irradia_runs::HOW_TO_GET_LPIPS as HOW;
+use irradia_runs::HOW_TO_GET_LPIPS as LPIPS_HINT;
 use irradia_runs::formats::{read_tensors, write_atomic};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// The environment variable that names a weights file, or a folder of them.
-const VARIABLE: &str = "IRRADIA_LPIPS";
+const ENVIRONMENT_VARIABLE: &str = "IRRADIA_LPIPS";
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -26,23 +26,23 @@ pub struct Args {
 pub fn run(args: &Args) -> Result<()> {
     match args.import.as_deref() {
         Some([features, heads]) => import(features, heads, args.out.as_deref()),
-        _ => show(),
+        _ => print_found(),
     }
 }
 
 /// Prints which weights are found.
-fn show() -> Result<()> {
+fn print_found() -> Result<()> {
     let mut found = false;
     for net in LpipsNet::ALL {
         if let Some(path) = find(None, Some(net)).unwrap_or(None) {
             found = true;
-            say(format_args!("{:<8} {}", net.name(), path.display()))?;
+            print_line(format_args!("{:<8} {}", net.name(), path.display()))?;
         }
     }
     if found {
         return Ok(());
     }
-    say(format_args!("no LPIPS weights found; {HOW}"))
+    print_line(format_args!("no LPIPS weights found; {LPIPS_HINT}"))
 }
 
 fn import(features: &Path, heads: &Path, out: Option<&Path>) -> Result<()> {
@@ -66,7 +66,7 @@ fn import(features: &Path, heads: &Path, out: Option<&Path>) -> Result<()> {
         }
     };
     write_atomic(&path, |out| out.write_all(&bytes))?;
-    say(format_args!("LPIPS of {net}: {}", path.display()))
+    print_line(format_args!("LPIPS of {net}: {}", path.display()))
 }
 
 /// Loads the LPIPS network, `net` if given, and prints its file; `None` if there is none.
@@ -80,12 +80,12 @@ pub fn lpips(given: Option<&PathBuf>, net: Option<LpipsNet>) -> Result<Option<Lp
         ))
         .into());
     }
-    tell(&lpips, &path);
+    print_network(&lpips, &path);
     Ok(Some(lpips))
 }
 
 /// Prints which network is used, and its file.
-pub fn tell(lpips: &Lpips, path: &Path) {
+pub fn print_network(lpips: &Lpips, path: &Path) {
     note(format_args!("LPIPS of {}: {}", lpips.net(), path.display()));
 }
 
@@ -97,14 +97,14 @@ pub fn lpips_path(given: Option<&PathBuf>) -> Result<Option<PathBuf>> {
 /// The file of a network other than that of `first`, used for scoring only: VGG's if it is found where weights are searched for, since
 /// most papers on view synthesis report it, else AlexNet's. `None` if there is none, or `given` is a file.
 pub fn unseen_lpips_path(given: Option<&PathBuf>, first: Option<&PathBuf>) -> Option<PathBuf> {
-    let folder = match named(given) {
+    let folder = match requested_path(given) {
         Some(path) if path.is_dir() => path,
         Some(_) => return None,
         None => data_folder()?,
     };
     let mut found = [LpipsNet::Vgg, LpipsNet::Alex]
         .into_iter()
-        .filter_map(|net| within(&folder, Some(net)));
+        .filter_map(|net| find_in_folder(&folder, Some(net)));
     let path = found.find(|path| first.is_some_and(|first| first.file_name() != path.file_name()))?;
     Some(std::path::absolute(&path).unwrap_or(path))
 }
@@ -115,39 +115,45 @@ pub fn unseen_lpips(given: Option<&PathBuf>, first: &Lpips) -> Result<Option<Lpi
         return Ok(None);
     };
     let lpips = Lpips::load(&path).context("LPIPS weights")?;
-    tell(&lpips, &path);
+    print_network(&lpips, &path);
     Ok(Some(lpips))
 }
 
 /// What `--lpips` or `IRRADIA_LPIPS` names.
-fn named(given: Option<&PathBuf>) -> Option<PathBuf> {
-    let variable = || std::env::var_os(VARIABLE).filter(|path| !path.is_empty());
+fn requested_path(given: Option<&PathBuf>) -> Option<PathBuf> {
+    let variable = || std::env::var_os(ENVIRONMENT_VARIABLE).filter(|path| !path.is_empty());
     given.cloned().or_else(|| variable().map(PathBuf::from))
 }
 
 /// Searches `--lpips`, `IRRADIA_LPIPS`, then the user's data directory. A path to a file is used directly; in a folder, files are
 /// found by their names, the first of [`LpipsNet::ALL`] unless a network is given.
 fn find(given: Option<&PathBuf>, net: Option<LpipsNet>) -> Result<Option<PathBuf>> {
-    let named = named(given);
+    let requested_path = requested_path(given);
     let missing = || match net {
         Some(net) => format!("LPIPS weights of {net} ({})", net.file_name()),
         None => "LPIPS weights".to_owned(),
     };
-    let path = match &named {
+    let path = match &requested_path {
         Some(path) if path.is_dir() => {
-            let found = within(path, net);
-            Some(found.ok_or_else(|| Usage(format!("{} does not contain {}; {HOW}", path.display(), missing())))?)
+            let found = find_in_folder(path, net);
+            Some(found.ok_or_else(|| {
+                Usage(format!(
+                    "{} does not contain {}; {LPIPS_HINT}",
+                    path.display(),
+                    missing()
+                ))
+            })?)
         }
         Some(path) => Some(path.clone()),
-        None => data_folder().and_then(|folder| within(&folder, net)),
+        None => data_folder().and_then(|folder| find_in_folder(&folder, net)),
     };
     if let (None, Some(_)) = (&path, net) {
-        return Err(Usage(format!("no {} found; {HOW}", missing())).into());
+        return Err(Usage(format!("no {} found; {LPIPS_HINT}", missing())).into());
     }
     Ok(path.map(|path| std::path::absolute(&path).unwrap_or(path)))
 }
 
-fn within(folder: &Path, net: Option<LpipsNet>) -> Option<PathBuf> {
+fn find_in_folder(folder: &Path, net: Option<LpipsNet>) -> Option<PathBuf> {
     let mut nets = LpipsNet::ALL
         .into_iter()
         .filter(|other| net.is_none_or(|net| net == *other));

@@ -4,6 +4,7 @@ pub mod compact;
 pub mod compare;
 pub mod convert;
 pub mod demo;
+mod depths;
 pub mod devices;
 pub mod doctor;
 pub mod edit;
@@ -27,7 +28,7 @@ use clap::builder::RangedU64ValueParser;
 use irradia_compute::{Device, DeviceChoice};
 use irradia_runs::formats::{Lenses, SplatFormat};
 use irradia_runs::scene::Dataset;
-use irradia_runs::{Reading, RunError, open_device};
+use irradia_runs::{Reading, ReadingOptions, RunError, open_device};
 use std::path::{Path, PathBuf};
 
 /// A part of a dataset.
@@ -87,33 +88,37 @@ pub struct DataArgs {
 
 impl DataArgs {
     /// The library's form of these options.
-    pub fn reading(&self) -> Reading {
-        let usual = Reading::default();
-        let sized = self.downscale.is_some() || self.full_size;
-        Reading {
+    pub fn options(&self) -> ReadingOptions {
+        ReadingOptions {
             format: self.format.clone(),
-            downscale: self.downscale.unwrap_or(usual.downscale),
-            max_side: self.max_side.or(usual.max_side.filter(|_| !sized)),
+            downscale: self.downscale,
+            max_side: self.max_side,
+            full_size: self.full_size,
             holdout: self.holdout.clone(),
             images: self.images.clone(),
-            lenses: self.lenses.unwrap_or(usual.lenses),
+            lenses: self.lenses,
             readout: self.readout.clone(),
         }
+    }
+
+    /// These options, and the defaults of those that are absent.
+    pub fn reading(&self) -> Reading {
+        self.options().with_fallback(Reading::default())
     }
 
     /// As [`DataArgs::reading`], for training on `device`: the GPU kernels for splats support pinhole cameras only.
     pub fn training(&self, device: Option<&str>) -> Reading {
         let on_cpu = device.is_none_or(|device| device.parse() == Ok(DeviceChoice::Cpu));
-        let usual = if on_cpu { Lenses::Whole } else { Lenses::Undistorted };
-        Reading {
-            lenses: self.lenses.unwrap_or(usual),
-            ..self.reading()
-        }
+        let lenses = if on_cpu { Lenses::Whole } else { Lenses::Undistorted };
+        self.options().with_fallback(Reading {
+            lenses,
+            ..Reading::default()
+        })
     }
 
     /// Reads the dataset; prints its warnings on standard error.
     pub fn read(&self, path: &Path) -> Result<Dataset> {
-        let dataset = self.reading().read(path).map_err(by_option)?;
+        let dataset = self.reading().read(path).map_err(with_option_names)?;
         warn(&dataset.warnings);
         Ok(dataset)
     }
@@ -121,7 +126,7 @@ impl DataArgs {
 
 /// The device that `--device` names for rendering; prints its name if it is a GPU.
 pub fn rendering_device(name: &str) -> Result<Device> {
-    let device = open_device(name).map_err(by_option)?;
+    let device = open_device(name).map_err(with_option_names)?;
     if !device.is_cpu() {
         note(format_args!("rendering on {device}"));
     }
@@ -129,7 +134,7 @@ pub fn rendering_device(name: &str) -> Result<Device> {
 }
 
 /// Rewrites an error of a request with the option names of the command line.
-pub fn by_option(error: RunError) -> anyhow::Error {
+pub fn with_option_names(error: RunError) -> anyhow::Error {
     match error {
         RunError::Setting { name, value, message } => {
             Usage(format!("--{} {value}: {message}", name.replace('_', "-"))).into()

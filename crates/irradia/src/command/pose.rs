@@ -1,16 +1,16 @@
 //! `irradia pose`, and poses for a training on bare photographs.
 
-use super::{by_option, thread_count, use_threads};
+use super::{thread_count, use_threads, with_option_names};
 use crate::Usage;
-use crate::terminal::{note, say};
+use crate::terminal::{note, print_line};
 use anyhow::{Context, Result};
 use clap::builder::RangedU64ValueParser;
 use indicatif::{ProgressBar, ProgressStyle};
 use irradia_runs::formats::DatasetFormat;
 use irradia_runs::scene::Dataset;
 use irradia_runs::{
-    ENOUGH_POSED, Finding, KnownDistance, Mapper, PoseInput, PoseProgress, PoseReport, TrainInput, by_reason,
-    is_capture, pose,
+    Finding, KnownDistance, MIN_POSED_FRACTION, Mapper, POSED_FOLDER, PoseInput, PoseProgress, PoseReport, TrainInput,
+    group_by_reason, is_capture, pose,
 };
 use std::collections::HashSet;
 use std::io::IsTerminal;
@@ -19,9 +19,11 @@ use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 /// Maximum number of findings of one kind that are printed in full.
-const TOLD: usize = 5;
+const MAX_PRINTED_FINDINGS: usize = 5;
+/// File in a dataset that lists its held-out views.
+const SPLIT_FILE: &str = "test.txt";
 /// Interval of plain lines.
-const LINE_EVERY: Duration = Duration::from_secs(5);
+const LINE_INTERVAL: Duration = Duration::from_secs(5);
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -91,8 +93,8 @@ pub fn run(args: &Args) -> Result<()> {
     input.mapper = args.poses.into();
     input.max_features = args.max_features;
     let report = pose_with_progress(&input)?;
-    say(summary(&report))?;
-    say(format_args!(
+    print_line(summary(&report))?;
+    print_line(format_args!(
         "train on it with: irradia train {} --out RUN",
         data.display()
     ))
@@ -111,7 +113,7 @@ pub fn pose_first(input: &mut TrainInput, poses: Poses, anyway: bool) -> Result<
     ));
     let report = pose_into_run(input, poses, None)?;
     let posed = &input.data;
-    if report.fraction() < ENOUGH_POSED && !anyway {
+    if report.fraction() < MIN_POSED_FRACTION && !anyway {
         let reasons: Vec<&str> = report
             .findings
             .iter()
@@ -140,30 +142,32 @@ pub fn pose_first(input: &mut TrainInput, poses: Poses, anyway: bool) -> Result<
     Ok(())
 }
 
-/// As [`pose_first`], for photographs whose poses in `dataset` are not used; the same views are held out. Fails if no pose is found for a
-/// held-out view, or for more than a few of the others, unless `anyway`, which trains on those with poses.
+/// As [`pose_first`], for photographs whose poses in `dataset` are not used; the same views are held out, left out and trained on. Fails if
+/// no pose is found for a held-out view, or for more than a few of the others, unless `anyway`, which trains on those with poses.
 pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses, anyway: bool) -> Result<()> {
     if let Some(images) = input.reading.images.take() {
         input.data = images;
     }
     input.reading.format = None;
-    let file_name = |name: &str| name.rsplit('/').next().unwrap_or(name).to_owned();
+    let names_of = |views: &[usize]| -> Vec<String> {
+        let names = views.iter().map(|view| bare_name(&dataset.views[*view].name));
+        names.map(str::to_owned).collect()
+    };
+    let (train, test) = (names_of(&dataset.train), names_of(&dataset.test));
     let mut listed = HashSet::new();
-    if let Some(view) = dataset.views.iter().find(|view| !listed.insert(file_name(&view.name))) {
+    if let Some(name) = train.iter().chain(&test).find(|name| !listed.insert((*name).clone())) {
         return Err(Usage(format!(
-            "several photographs are called {}, but held-out ones are identified by their names: train with --poses given, or rename them",
-            file_name(&view.name)
+            "several photographs are called {name}, but held-out ones are identified by their names: train with --poses given, or rename \
+             them"
         ))
         .into());
     }
     let report = pose_into_run(input, poses, Some(listed))?;
-    let left_out: HashSet<&str> = report.left_out.iter().map(|left| left.name.as_str()).collect();
-    let lost = |views: &[usize]| {
-        let names = views.iter().map(|view| file_name(&dataset.views[*view].name));
-        names.filter(|name| left_out.contains(name.as_str())).count()
-    };
-    let (train, test) = (lost(&dataset.train), lost(&dataset.test));
-    if !anyway && (test > 0 || train as f64 > (1.0 - ENOUGH_POSED) * dataset.train.len() as f64) {
+    let left_out: HashSet<&str> = report.left_out.iter().map(|left| bare_name(&left.name)).collect();
+    let is_lost = |name: &&String| left_out.contains(name.as_str());
+    let held_out: Vec<&str> = test.iter().filter(|name| !is_lost(name)).map(String::as_str).collect();
+    let (train, test) = (train.iter().filter(is_lost).count(), test.len() - held_out.len());
+    if !anyway && (test > 0 || train as f64 > (1.0 - MIN_POSED_FRACTION) * dataset.train.len() as f64) {
         return Err(Usage(format!(
             "no new pose was found for {train} of {} training views and {test} of {} held-out ones; train with --poses given, or with --anyway on the others",
             dataset.train.len(),
@@ -171,27 +175,25 @@ pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses, anywa
         ))
         .into());
     }
-    let names: Vec<String> = dataset
-        .test
-        .iter()
-        .map(|view| file_name(&dataset.views[*view].name))
-        .filter(|name| !left_out.contains(name.as_str()))
-        .collect();
-    let list = input.data.join("test.txt");
-    if !names.is_empty() {
-        std::fs::write(&list, names.join("\n") + "\n").with_context(|| format!("cannot write {}", list.display()))?;
-        // The list is the split of the posed dataset. By another one, other views would be held out.
-        input.reading.holdout = None;
-    } else if list.exists() {
-        // Of an earlier run.
-        std::fs::remove_file(&list).with_context(|| format!("cannot remove {}", list.display()))?;
+    // By another split, other views would be held out; without any, every 8th.
+    input.reading.holdout = held_out.is_empty().then(|| "0".to_owned());
+    if !held_out.is_empty() {
+        let list = input.data.join(SPLIT_FILE);
+        std::fs::write(&list, held_out.join("\n") + "\n")
+            .with_context(|| format!("cannot write {}", list.display()))?;
     }
     Ok(())
 }
 
+/// The last part of a view's name, without extension: a dataset may name photographs with the extension that they had before a conversion.
+fn bare_name(name: &str) -> &str {
+    let last = name.rsplit('/').next().unwrap_or(name);
+    last.rsplit_once('.').map_or(last, |(bare, _)| bare)
+}
+
 /// Poses the photographs of `input`, or `only` some, into the folder `posed` of its run, and makes that its dataset.
 fn pose_into_run(input: &mut TrainInput, poses: Poses, only: Option<HashSet<String>>) -> Result<PoseReport> {
-    let posed = input.out.join("posed");
+    let posed = input.out.join(POSED_FOLDER);
     note(format_args!("finding poses, which are written to {}", posed.display()));
     let data = std::mem::replace(&mut input.data, posed.clone());
     let request = PoseInput {
@@ -201,11 +203,16 @@ fn pose_into_run(input: &mut TrainInput, poses: Poses, only: Option<HashSet<Stri
     };
     let report = pose_with_progress(&request)?;
     note(summary(&report));
+    let list = posed.join(SPLIT_FILE);
+    if list.exists() {
+        // Of an earlier run.
+        std::fs::remove_file(&list).with_context(|| format!("cannot remove {}", list.display()))?;
+    }
     Ok(report)
 }
 
 fn pose_with_progress(input: &PoseInput) -> Result<PoseReport> {
-    let report = with_progress(|progress| pose(input, progress)).map_err(by_option)?;
+    let report = with_progress(|progress| pose(input, progress)).map_err(with_option_names)?;
     let unread = |name: &str| {
         !report
             .findings
@@ -213,8 +220,8 @@ fn pose_with_progress(input: &PoseInput) -> Result<PoseReport> {
             .any(|f| f.kind == "left-out" && f.photos == [name])
     };
     // One line per reason.
-    let told = report.left_out.iter().filter(|left| unread(&left.name));
-    for (reason, names) in by_reason(told.map(|left| (&left.name[..], &left.reason[..]))) {
+    let unreported = report.left_out.iter().filter(|left| unread(&left.name));
+    for (reason, names) in group_by_reason(unreported.map(|left| (&left.name[..], &left.reason[..]))) {
         let first = names[0];
         match names.len() - 1 {
             0 => note(format_args!("left out: {first}: {reason}")),
@@ -222,7 +229,7 @@ fn pose_with_progress(input: &PoseInput) -> Result<PoseReport> {
             others => note(format_args!("left out: {first} and {others} others: {reason}")),
         }
     }
-    tell_findings(&report.findings, |line| {
+    print_findings(&report.findings, |line| {
         note(line);
         Ok(())
     })?;
@@ -244,15 +251,15 @@ pub fn with_progress<T>(work: impl FnOnce(&(dyn Fn(PoseProgress) + Sync)) -> T) 
     result
 }
 
-/// One line per finding, at most [`TOLD`] of each kind.
-pub fn tell_findings(findings: &[Finding], mut tell: impl FnMut(&str) -> Result<()>) -> Result<()> {
+/// One line per finding, at most [`MAX_PRINTED_FINDINGS`] of each kind.
+pub fn print_findings(findings: &[Finding], mut print: impl FnMut(&str) -> Result<()>) -> Result<()> {
     for (i, finding) in findings.iter().enumerate() {
         let same = |other: &&Finding| other.kind == finding.kind;
         match findings[..i].iter().filter(same).count() {
-            before if before < TOLD => tell(&format!("{}: {}", finding.kind, finding.sentence))?,
-            TOLD => {
+            before if before < MAX_PRINTED_FINDINGS => print(&format!("{}: {}", finding.kind, finding.sentence))?,
+            MAX_PRINTED_FINDINGS => {
                 let more = findings[i..].iter().filter(same).count();
-                tell(&format!("{}: {more} more such findings", finding.kind))?;
+                print(&format!("{}: {more} more such findings", finding.kind))?;
             }
             _ => {}
         }
@@ -322,7 +329,7 @@ impl Display {
                 }
             }
             (PoseProgress::Done(done), Some(bar)) => bar.set_position(done as u64),
-            (PoseProgress::Done(done), None) if self.last_line.elapsed() >= LINE_EVERY => {
+            (PoseProgress::Done(done), None) if self.last_line.elapsed() >= LINE_INTERVAL => {
                 match self.of {
                     0 => note(format_args!("{} {done}", self.stage)),
                     of => note(format_args!("{} {done}/{of}", self.stage)),

@@ -25,7 +25,7 @@ pub struct Progress {
 }
 
 /// Interval of plain lines.
-const LINE_EVERY: Duration = Duration::from_secs(5);
+const LINE_INTERVAL: Duration = Duration::from_secs(5);
 
 impl Progress {
     /// `stop`, once set, ends the run at the next step.
@@ -53,7 +53,7 @@ impl Progress {
         }
     }
 
-    fn say(&self, line: &str) {
+    fn print_line(&self, line: &str) {
         match &self.bar {
             Some(bar) => bar.suspend(|| note(line)),
             None => note(line),
@@ -69,7 +69,7 @@ impl Progress {
             "loss {:.4} psnr {:.2} dB{held_out} {} {rate:.1} steps/s {}",
             report.loss,
             (-10.0 * mse.log10()).clamp(f64::NEG_INFINITY, MAX_PSNR),
-            size_in_words(report.splats as u64, report.parameters.map(|n| n as u64)),
+            format_size(report.splats as u64, report.parameters.map(|n| n as u64)),
             self.stage
         );
         match &self.bar {
@@ -78,7 +78,7 @@ impl Progress {
                 bar.set_position(report.step);
                 bar.set_message(format!("eta {} {message}", eta(report.seconds_left_range)));
             }
-            None if self.last_line.elapsed() >= LINE_EVERY => {
+            None if self.last_line.elapsed() >= LINE_INTERVAL => {
                 note(format_args!(
                     "step {}/{} {message} eta {}",
                     report.step,
@@ -104,7 +104,7 @@ fn eta([low, high]: [f64; 2]) -> String {
 }
 
 /// The size of a scene: splats, or the parameters of a field.
-pub fn size_in_words(splats: u64, parameters: Option<u64>) -> String {
+pub fn format_size(splats: u64, parameters: Option<u64>) -> String {
     parameters.map_or_else(|| format!("{splats} splats"), |n| format!("{n} parameters"))
 }
 
@@ -125,22 +125,22 @@ impl Observer for Progress {
                     bar.set_length(*total_steps);
                     bar.set_position(*step);
                 }
-                let size = size_in_words(*splats as u64, parameters.map(|n| n as u64));
-                self.say(&format!("{recipe}: {size}, {views} views, {total_steps} steps"));
+                let size = format_size(*splats as u64, parameters.map(|n| n as u64));
+                self.print_line(&format!("{recipe}: {size}, {views} views, {total_steps} steps"));
             }
             Event::StageEntered { stage, .. } => self.stage.clone_from(stage),
             Event::Step(report) => self.step(report, trainer),
             Event::Evaluated { psnr, .. } => self.held_out = Some(*psnr),
-            Event::Decided { message } => self.say(message),
-            Event::Warned { message } => self.say(&format!("warning: {message}")),
+            Event::Decided { message } => self.print_line(message),
+            Event::Warned { message } => self.print_line(&format!("warning: {message}")),
             Event::Finished { step, seconds, reason } => {
                 if let Some(bar) = self.bar.take() {
                     bar.finish_and_clear();
                 }
-                self.say(&format!("{reason} after {step} steps, {seconds:.1} s of training"));
+                self.print_line(&format!("{reason} after {step} steps, {seconds:.1} s of training"));
             }
-            Event::Paused { step } => self.say(&format!("paused after {step} steps")),
-            Event::Resumed { .. } => self.say("resumed"),
+            Event::Paused { step } => self.print_line(&format!("paused after {step} steps")),
+            Event::Resumed { .. } => self.print_line("resumed"),
             Event::Densified { .. } | Event::Saved { .. } => {}
         }
         self.signal()

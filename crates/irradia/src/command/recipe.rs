@@ -1,7 +1,7 @@
 //! `irradia recipe`
 
 use super::recipe_keys;
-use crate::terminal::say;
+use crate::terminal::print_line;
 use anyhow::Result;
 use irradia_runs::read_recipe;
 use irradia_train::Recipe;
@@ -48,9 +48,9 @@ pub fn run(args: &Args) -> Result<()> {
         Action::Show(args) => {
             let recipe = read_recipe(&args.recipe, &args.set)?;
             if args.toml {
-                say(recipe.to_toml().trim_end())
+                print_line(recipe.to_toml().trim_end())
             } else {
-                say(plan(&recipe, args.steps.unwrap_or(recipe.total_steps())).trim_end())
+                print_line(plan(&recipe, args.steps.unwrap_or(recipe.total_steps())).trim_end())
             }
         }
     }
@@ -66,16 +66,16 @@ fn list() -> Result<()> {
             recipe.about,
         ]);
     }
-    say(columns(&lines, 3).trim_end())
+    print_line(columns(&lines, 3).trim_end())
 }
 
 /// Number of points in time at which parameters are shown, in addition to the ends of stages.
-const POINTS: usize = 6;
+const OUTLINE_POINTS: usize = 6;
 
 /// The schedule of `recipe` in `steps` steps, as tables.
 fn plan(recipe: &Recipe, steps: u64) -> String {
     let pace = recipe.total_steps() as f64 / steps as f64;
-    let points = outline(recipe, POINTS);
+    let points = outline(recipe, OUTLINE_POINTS);
     let mut text = format!("{}: {}\n{steps} steps", recipe.name, recipe.about);
     if steps != recipe.total_steps() {
         text += &format!(" instead of the recipe's {}", recipe.total_steps());
@@ -102,7 +102,7 @@ fn plan(recipe: &Recipe, steps: u64) -> String {
         let mut lines = vec![heads, names];
         for param in moving {
             let mut line = vec![param.name().to_owned()];
-            line.extend(shown.iter().map(|point| figure(point.values[param])));
+            line.extend(shown.iter().map(|point| format_number(point.values[param])));
             lines.push(line);
         }
         text += &format!("\nChanging parameters:\n{}", columns(&lines, 1));
@@ -110,7 +110,7 @@ fn plan(recipe: &Recipe, steps: u64) -> String {
     let lines: Vec<Vec<String>> = still
         .iter()
         .filter(|param| points[0].values[**param] != 0.0)
-        .map(|param| vec![param.name().to_owned(), figure(points[0].values[*param])])
+        .map(|param| vec![param.name().to_owned(), format_number(points[0].values[*param])])
         .collect();
     text + &format!("\nConstant parameters:\n{}", columns(&lines, 1))
 }
@@ -126,7 +126,7 @@ fn stages(recipe: &Recipe, points: &[OutlinePoint], pace: f64) -> Vec<Vec<String
         lines.push(vec![
             stage.name.clone(),
             format!("{:.0} - {:.0}", (start / pace).floor() + 1.0, end / pace),
-            course(&within, Param::ImageScale),
+            format_range(&within, Param::ImageScale),
             match stage.represents {
                 Represents::Splats => losses(&within),
                 Represents::Field => "squared error of rays".into(),
@@ -140,13 +140,13 @@ fn stages(recipe: &Recipe, points: &[OutlinePoint], pace: f64) -> Vec<Vec<String
 }
 
 /// The value of a parameter in a stage, or its first and last.
-fn course(within: &[&OutlinePoint], param: Param) -> String {
+fn format_range(within: &[&OutlinePoint], param: Param) -> String {
     let value = |point: Option<&&OutlinePoint>| point.map_or(0.0, |point| point.values[param]);
     let (first, last) = (value(within.first()), value(within.last()));
     if first == last {
-        figure(first)
+        format_number(first)
     } else {
-        format!("{} to {}", figure(first), figure(last))
+        format!("{} to {}", format_number(first), format_number(last))
     }
 }
 
@@ -161,7 +161,7 @@ fn losses(within: &[&OutlinePoint]) -> String {
             let name = param.name();
             let (name, kind) = name.rsplit_once('_').unwrap_or((name, ""));
             let name = if kind == "weight" { name } else { kind };
-            format!("{name} {}", course(within, param))
+            format!("{name} {}", format_range(within, param))
         };
         let parts: Vec<String> = with_group(Group::PartOf(loss)).map(named).collect();
         let parts = if parts.is_empty() {
@@ -218,7 +218,7 @@ fn distinct(points: &[OutlinePoint], pace: f64) -> Vec<&OutlinePoint> {
 }
 
 /// Formats with three significant digits.
-fn figure(value: f64) -> String {
+fn format_number(value: f64) -> String {
     if value == 0.0 {
         return "0".into();
     }
@@ -253,7 +253,7 @@ mod tests {
             (5e6, "5e6"),
         ];
         for (value, want) in cases {
-            assert_eq!(figure(value), want);
+            assert_eq!(format_number(value), want);
         }
     }
 

@@ -1,7 +1,7 @@
 //! `irradia recipe keys`: the keys of recipes.
 
 use crate::Usage;
-use crate::terminal::say;
+use crate::terminal::print_line;
 use anyhow::Result;
 use irradia_train::recipe::keys::{Key, find, keys};
 
@@ -21,7 +21,7 @@ pub fn run(args: &Args) -> Result<()> {
             find(word).map_err(|nearest| Usage(format!("no recipe key contains `{word}`; the nearest is {nearest}")))?
         }
     };
-    say(if args.markdown { markdown(&keys) } else { plain(&keys) }.trim_end())
+    print_line(if args.markdown { markdown(&keys) } else { plain(&keys) }.trim_end())
 }
 
 /// Keys by section, in order.

@@ -1,13 +1,14 @@
 //! `irradia render`
 
+use super::depths::Depths;
 use super::film::{self, FilmWriter};
 use super::{DataArgs, Split, rendering_device, thread_count, use_threads, warn};
 use crate::Usage;
-use crate::terminal::say;
+use crate::terminal::print_line;
 use anyhow::{Context, Result};
 use irradia_runs::scene::{Camera, Image};
 use irradia_runs::train::painter::Painter;
-use irradia_runs::{Film, Scene, file_stems, is_film_name, write_image};
+use irradia_runs::{Film, Scene, file_stems, is_film_name, moved_from_run, scene_path, write_image};
 use std::path::{Path, PathBuf};
 
 #[derive(clap::Args)]
@@ -96,12 +97,19 @@ fn film(args: &Args, scene: &Scene) -> Result<Option<Film>> {
         return Ok(Some(Film::orbit(scene, frames, args.size)));
     }
     let path = args.path.as_deref();
-    path.map(|path| film_of(path, scene, args.frames, args.size))
+    path.map(|path| film_from_path(path, &args.scene, scene, args.frames, args.size))
         .transpose()
 }
 
-/// The cameras of the path `path`: a file, `orbit`, `spiral` or `training`, which have `frames` frames.
-pub(super) fn film_of(path: &Path, scene: &Scene, frames: u32, size: Option<(u32, u32)>) -> Result<Film> {
+/// The cameras of the path `path` around the scene that was read from `source`: a file, `orbit`, `spiral` or `training`, which have
+/// `frames` frames.
+pub(super) fn film_from_path(
+    path: &Path,
+    source: &Path,
+    scene: &Scene,
+    frames: u32,
+    size: Option<(u32, u32)>,
+) -> Result<Film> {
     Ok(match path.to_str() {
         Some("orbit") => Film::orbit(scene, frames, size),
         Some("spiral") => Film::spiral(scene, frames, size),
@@ -110,8 +118,14 @@ pub(super) fn film_of(path: &Path, scene: &Scene, frames: u32, size: Option<(u32
             film.ok_or_else(|| Usage("--path training: the cameras of this scene are not known".into()))?
         }
         _ => {
-            let k = scene.outlook().intrinsics;
-            Film::read(path, &scene.world_from_dataset, size.unwrap_or((k.width, k.height)))?
+            let k = scene.orbit_geometry().intrinsics;
+            let moved = moved_from_run(&scene_path(source));
+            Film::read(
+                path,
+                &moved,
+                &scene.world_from_dataset,
+                size.unwrap_or((k.width, k.height)),
+            )?
         }
     })
 }
@@ -136,7 +150,7 @@ fn write_film(args: &Args, scene: &Scene, film: &Film) -> Result<()> {
         writer.add(&painter.render(camera, &scene.options)?.color)?;
     }
     writer.finish()?;
-    say(format_args!("{} frames in {}", film.cameras.len(), args.out.display()))
+    print_line(format_args!("{} frames in {}", film.cameras.len(), args.out.display()))
 }
 
 fn write_frames(args: &Args, scene: &Scene, cameras: Vec<(String, Camera)>) -> Result<()> {
@@ -153,7 +167,7 @@ fn write_frames(args: &Args, scene: &Scene, cameras: Vec<(String, Camera)>) -> R
     }
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
     let mut painter = painter(args, scene)?;
-    let mut depths = Vec::new();
+    let mut depths = args.depth.then(|| Depths::begin(&args.out)).transpose()?;
     let write = |name: &str, what: &str, image: &Image| -> Result<()> {
         Ok(write_image(args.out.join(format!("{name}{what}.png")), image)?)
     };
@@ -161,23 +175,18 @@ fn write_frames(args: &Args, scene: &Scene, cameras: Vec<(String, Camera)>) -> R
         let frame = painter.render(camera, &scene.options)?;
         let image = frame.color;
         write(name, "", &image)?;
-        let alpha = Image::new(image.width, image.height, 1, frame.alpha);
-        if args.depth {
-            let expected = frame.depth.iter().zip(&alpha.data);
-            let inverse = expected.map(|(d, a)| if *a > 0.5 { a / d } else { 0.0 }).collect();
-            depths.push(Image::new(image.width, image.height, 1, inverse));
+        if let Some(depths) = &mut depths {
+            let expected = frame.depth.iter().zip(&frame.alpha);
+            let inverse = expected.map(|(d, a)| if *a > 0.5 { a / d } else { 0.0 });
+            depths.add(name, (image.width, image.height), inverse)?;
         }
         if args.alpha {
+            let alpha = Image::new(image.width, image.height, 1, frame.alpha);
             write(name, ".alpha", &alpha)?;
         }
     }
-    // One range of inverse depth for all frames; distant parts, usually most of the scene, get few levels of it.
-    let nearest = depths.iter().flat_map(|d| &d.data).fold(0.0f32, |m, v| m.max(*v));
-    for ((name, _), mut image) in cameras.iter().zip(depths) {
-        for value in &mut image.data {
-            *value /= nearest.max(1e-20);
-        }
-        write(name, ".depth", &image)?;
+    if let Some(depths) = depths {
+        depths.finish(|name, image| write(name, ".depth", image))?;
     }
-    say(format_args!("{} frames in {}", cameras.len(), args.out.display()))
+    print_line(format_args!("{} frames in {}", cameras.len(), args.out.display()))
 }

@@ -1,12 +1,12 @@
 //! `irradia share`
 
-use super::render::film_of;
+use super::render::film_from_path;
 use super::warn;
 use crate::Usage;
-use crate::terminal::say;
+use crate::terminal::print_line;
 use anyhow::Result;
 use irradia_runs::formats::SplatFormat;
-use irradia_runs::{Film, Scene, check_kept, residual_left_out, scene_of};
+use irradia_runs::{Film, Scene, check_not_overwritten, residual_left_out, scene_path};
 use irradia_viewer::{ShareOptions, share};
 use std::path::{Path, PathBuf};
 
@@ -53,11 +53,11 @@ pub(super) fn parse_size(text: &str) -> Result<u64, String> {
 }
 
 /// Frames of a flight that is not read from a file: ten seconds.
-const FLIGHT: u32 = 300;
+const FLIGHT_FRAMES: u32 = 300;
 
-/// The flight along `path`; an orbit or spiral ends where it began.
-fn flight(path: &Path, scene: &Scene) -> Result<Film> {
-    let mut film = film_of(path, scene, FLIGHT, None)?;
+/// The flight along `path` around the scene that was read from `source`; an orbit or spiral ends where it began.
+fn flight(path: &Path, source: &Path, scene: &Scene) -> Result<Film> {
+    let mut film = film_from_path(path, source, scene, FLIGHT_FRAMES, None)?;
     if path.as_os_str() != "training" && !path.is_file() {
         film.cameras.extend(film.cameras.first().copied());
     }
@@ -90,7 +90,7 @@ pub fn run(args: &Args) -> Result<()> {
         ))
         .into());
     }
-    check_kept(&args.scene, &args.out)?;
+    check_not_overwritten(&args.scene, &args.out)?;
     if !args.folder && SplatFormat::of(&args.out).is_ok() {
         return Err(Usage(format!(
             "--out {}: the name of a page ends in .html; irradia convert writes splat files",
@@ -101,7 +101,7 @@ pub fn run(args: &Args) -> Result<()> {
     let scene = Scene::read(&args.scene)?;
     warn(&scene.notes);
     warn(&Vec::from_iter(residual_left_out(
-        &scene_of(&args.scene),
+        &scene_path(&args.scene),
         "a page cannot hold it",
     )));
     let name = || {
@@ -115,7 +115,9 @@ pub fn run(args: &Args) -> Result<()> {
         credits: args.credits.clone(),
         max_bytes: args.max,
         folder: args.folder,
-        path: args.path.as_deref().map(|path| flight(path, &scene)).transpose()?,
+        path: (args.path.as_deref())
+            .map(|path| flight(path, &args.scene, &scene))
+            .transpose()?,
     };
     let shared = share(&scene, &args.out, &options)?;
     let [splats, of] = shared.splats;
@@ -132,7 +134,7 @@ pub fn run(args: &Args) -> Result<()> {
     } else {
         format!("\n  lost           {}", lost.join(", "))
     };
-    say(format_args!(
+    print_line(format_args!(
         "{}: {splats} splats of degree {degree}, {:.2} MB{lost}",
         args.out.display(),
         shared.bytes as f64 / 1e6

@@ -2,19 +2,19 @@
 
 use super::lpips::{self, lpips_path, unseen_lpips_path};
 use super::pose::{Poses, is_unposed, pose_again, pose_first};
-use super::progress::{Progress, size_in_words};
+use super::progress::{Progress, format_size};
 use super::view::ListenArgs;
-use super::{DataArgs, by_option, thread_count, use_threads, warn};
+use super::{DataArgs, thread_count, use_threads, warn, with_option_names};
 use crate::Usage;
 use crate::interrupt::stop_flag;
-use crate::terminal::{note, one_line, say};
+use crate::terminal::{note, one_line, print_line};
 use anyhow::{Result, anyhow, ensure};
 use clap::builder::RangedU64ValueParser;
 use irradia_compute::DeviceChoice;
 use irradia_runs::scene::Dataset;
 use irradia_runs::{
-    Background, DEFAULT_RECIPE, Finished, PoseCheck, PosesBy, Reading, Run, RunError, RunFolder, TrainInput,
-    TrainRequest, check_poses, poses_by,
+    Background, DEFAULT_RECIPE, Finished, PoseCheck, PoseSource, Reading, Run, RunError, RunFolder, TrainInput,
+    TrainRequest, check_poses, pose_source,
 };
 use irradia_train::event::Observer;
 use std::path::{Path, PathBuf};
@@ -38,11 +38,11 @@ pub struct Args {
     /// Poses to use: those given with the photographs, or new ones by irradia, or by colmap, if it is installed. When absent the given
     /// ones, unless there are none or the photographs contradict them; then irradia's
     #[arg(long, value_name = "WHO", value_enum, conflicts_with_all = ["resume", "replay"])]
-    pub poses: Option<PosesOf>,
+    pub poses: Option<PosesArg>,
     /// Where splats begin if the dataset has poses and no points: at points found by matching its photographs (matched), or at random
     /// positions (given)
-    #[arg(long, value_name = "WHICH", value_enum, default_value_t = PointsOf::Matched, conflicts_with_all = ["resume", "replay"])]
-    pub points: PointsOf,
+    #[arg(long, value_name = "WHICH", value_enum, default_value_t = PointsArg::Matched, conflicts_with_all = ["resume", "replay"])]
+    pub points: PointsArg,
     /// Train even if fewer than 80 % of the photographs could be posed, or some held-out ones could not
     #[arg(long)]
     pub anyway: bool,
@@ -76,8 +76,9 @@ pub struct Args {
     /// bytes of the scene; --replay reproduces them
     #[arg(long, value_name = "TIME", value_parser = parse_seconds)]
     pub budget: Option<f64>,
-    /// Resume an interrupted run from its latest checkpoint; the result is that of an uninterrupted run
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["out", "overwrite", "downscale", "max_side", "full_size", "holdout", "format", "lenses", "readout"])]
+    /// Resume an interrupted run from its latest checkpoint; the result is that of an uninterrupted run. The same views are held out; a
+    /// --holdout that selects others is refused
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["out", "overwrite", "downscale", "max_side", "full_size", "format", "lenses", "readout"])]
     pub resume: Option<PathBuf>,
     /// Repeat RUN into --out, each step at its recorded pace: the same bytes, even for a run with a --budget
     #[arg(long, value_name = "RUN", conflicts_with_all = ["resume", "recipe", "set", "steps", "max_splats", "seed", "until_psnr", "budget", "downscale", "max_side", "full_size", "holdout", "format", "lenses", "readout", "background", "from"])]
@@ -104,7 +105,7 @@ pub struct Args {
 
 /// Which poses are used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-pub enum PosesOf {
+pub enum PosesArg {
     Given,
     Irradia,
     Colmap,
@@ -112,12 +113,12 @@ pub enum PosesOf {
 
 /// Which points splats begin from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-pub enum PointsOf {
+pub enum PointsArg {
     Matched,
     Given,
 }
 
-impl PosesOf {
+impl PosesArg {
     /// The program that finds new poses; `None` for the given ones.
     fn mapper(self) -> Option<Poses> {
         match self {
@@ -181,9 +182,9 @@ pub fn run(args: &Args) -> Result<()> {
             let mut input = input(args)?;
             if is_unposed(&input.data) {
                 // Posing takes a while: mistakes are reported first.
-                input.clone().check().map_err(by_option)?;
+                input.clone().check().map_err(with_option_names)?;
                 RunFolder::check_free(&input.out, input.overwrite)?;
-                let Some(mapper) = args.poses.map_or(Some(Poses::Irradia), PosesOf::mapper) else {
+                let Some(mapper) = args.poses.map_or(Some(Poses::Irradia), PosesArg::mapper) else {
                     let message = format!("{} has no poses: omit --poses given", input.data.display());
                     return Err(Usage(message).into());
                 };
@@ -199,26 +200,26 @@ pub fn run(args: &Args) -> Result<()> {
 /// The input that repeats `run`.
 fn replay(run: &Path, args: &Args) -> Result<TrainInput> {
     let out = args.out.clone().expect("required by clap");
-    let mut input = placed_by(args, TrainInput::replay_of(run, out)?)?;
+    let mut input = with_local_settings(args, TrainInput::replay_of(run, out)?)?;
     input.overwrite = args.overwrite;
     Ok(input)
 }
 
 /// The input of a run, with the settings that may differ by now or on another machine: its files, memory and device.
-fn placed_by(args: &Args, mut input: TrainInput) -> Result<TrainInput> {
+fn with_local_settings(args: &Args, mut input: TrainInput) -> Result<TrainInput> {
     if let Some(data) = &args.data {
         input.data.clone_from(data);
     }
     input.reading.images = args.reading.images.clone().or(input.reading.images);
     input.memory = args.memory.or(input.memory);
     input.device = args.device.clone().unwrap_or(input.device);
-    input.lpips = lpips_for(input.lpips, args)?;
+    input.lpips = resolve_lpips(input.lpips, args)?;
     input.unseen_lpips = input.unseen_lpips.filter(|path| path.exists());
     Ok(input)
 }
 
 /// The weights with which a run began, if they still exist: without them a perceptual loss would be skipped.
-fn lpips_for(kept: Option<PathBuf>, args: &Args) -> Result<Option<PathBuf>> {
+fn resolve_lpips(kept: Option<PathBuf>, args: &Args) -> Result<Option<PathBuf>> {
     let kept = kept.filter(|path| path.exists());
     lpips_path(args.lpips.as_ref().or(kept.as_ref()))
 }
@@ -241,7 +242,7 @@ fn input(args: &Args) -> Result<TrainInput> {
         reading: args.reading.training(args.device.as_deref()),
         background: args.background,
         from: args.from.clone(),
-        match_points: args.points == PointsOf::Matched,
+        match_points: args.points == PointsArg::Matched,
         device: args
             .device
             .clone()
@@ -253,16 +254,17 @@ fn input(args: &Args) -> Result<TrainInput> {
 
 /// The dataset of `input`, whose photographs have poses: with the given poses, or with new ones if they are requested or the photographs
 /// contradict the given ones.
-fn with_poses(input: TrainInput, poses: Option<PosesOf>, anyway: bool) -> Result<(TrainRequest, Dataset)> {
+fn with_poses(input: TrainInput, poses: Option<PosesArg>, anyway: bool) -> Result<(TrainRequest, Dataset)> {
     let given = read(input.clone())?;
     RunFolder::check_free(&input.out, input.overwrite)?;
-    if let Some(mapper) = poses.and_then(PosesOf::mapper) {
+    if let Some(mapper) = poses.and_then(PosesArg::mapper) {
         let mut again = input;
         pose_again(&mut again, &given.1, mapper, anyway)?;
         return read(again);
     }
     // Rendered scenes are exact, our own poses have been checked, and the splats of --from are in the world of the given poses.
-    let is_sure = given.1.kind == "Blender" || poses_by(&input.data) == Some(PosesBy::Irradia) || input.from.is_some();
+    let is_sure =
+        given.1.kind == "Blender" || pose_source(&input.data) == Some(PoseSource::Irradia) || input.from.is_some();
     if poses.is_some() || is_sure {
         return Ok(given);
     }
@@ -289,7 +291,7 @@ fn with_poses(input: TrainInput, poses: Option<PosesOf>, anyway: bool) -> Result
     note(format_args!(
         "{line}: finding new ones; --poses given keeps the given ones"
     ));
-    match found_anew(input, &given.1, found.share()) {
+    match find_better_poses(input, &given.1, found.share()) {
         Ok((request, mut dataset)) => {
             let line = format!("{line}: new ones are used, in a world of their own");
             dataset.warnings.push(line);
@@ -304,7 +306,7 @@ fn with_poses(input: TrainInput, poses: Option<PosesOf>, anyway: bool) -> Result
 
 /// The dataset of `input` with new poses, if the share of pairs that contradict them is less than half of `contradicted`, that of the poses
 /// of `given`.
-fn found_anew(mut input: TrainInput, given: &Dataset, contradicted: f64) -> Result<(TrainRequest, Dataset)> {
+fn find_better_poses(mut input: TrainInput, given: &Dataset, contradicted: f64) -> Result<(TrainRequest, Dataset)> {
     pose_again(&mut input, given, Poses::Irradia, false)?;
     let share = check(&input)?.share();
     ensure!(
@@ -318,7 +320,7 @@ fn found_anew(mut input: TrainInput, given: &Dataset, contradicted: f64) -> Resu
 }
 
 fn read(input: TrainInput) -> Result<(TrainRequest, Dataset)> {
-    let request = input.check().map_err(by_option)?;
+    let request = input.check().map_err(with_option_names)?;
     let dataset = request.read_dataset()?;
     Ok((request, dataset))
 }
@@ -334,7 +336,7 @@ fn check(input: &TrainInput) -> Result<PoseCheck> {
 
 /// Begins a new run on the current threads, and finishes it; `viewer` shows it while it trains.
 pub fn begin(input: TrainInput, viewer: Option<&ListenArgs>) -> Result<()> {
-    let request = input.check().map_err(by_option)?;
+    let request = input.check().map_err(with_option_names)?;
     RunFolder::check_free(&request.input().out, request.input().overwrite)?;
     let dataset = request.read_dataset()?;
     begin_on(request, dataset, viewer)
@@ -343,10 +345,12 @@ pub fn begin(input: TrainInput, viewer: Option<&ListenArgs>) -> Result<()> {
 fn begin_on(request: TrainRequest, dataset: Dataset, viewer: Option<&ListenArgs>) -> Result<()> {
     warn(&dataset.warnings);
     warn(&request.warnings());
-    if request.matches_points(&dataset) {
+    if request.should_match_points(&dataset) {
         note("the dataset has no points: matching its photographs");
     }
-    let run = Run::begin_on(request, dataset).map_err(by_option)?;
+    let known = dataset.warnings.len();
+    let run = Run::begin_on(request, dataset).map_err(with_option_names)?;
+    warn(&run.trainer().dataset.warnings[known..]);
     note(format_args!("background: {}", run.background()));
     finish(run, viewer)
 }
@@ -355,22 +359,25 @@ fn resume(folder: &Path, args: &Args) -> Result<()> {
     let (opened, record) = RunFolder::open(folder)?;
     if record.complete {
         let report = opened.file("report.html");
-        return say(format_args!(
+        return print_line(format_args!(
             "{} is complete: see {}",
             folder.display(),
             report.display()
         ));
     }
-    let mut input = placed_by(args, TrainInput::of_run(folder)?)?;
+    let mut input = with_local_settings(args, TrainInput::of_run(folder)?)?;
     if args.budget.is_some() {
         (input.budget, input.steps) = (args.budget, None);
     }
     input.until_psnr = args.until_psnr.or(input.until_psnr);
-    let request = input.check().map_err(by_option)?;
+    input.reading.holdout = args.reading.holdout.clone().or(input.reading.holdout);
+    let request = input.check().map_err(with_option_names)?;
     let dataset = request.read_dataset()?;
     warn(&dataset.warnings);
     warn(&request.warnings());
-    let run = Run::resume_on(request, dataset)?;
+    let known = dataset.warnings.len();
+    let run = Run::resume_on(request, dataset).map_err(with_option_names)?;
+    warn(&run.trainer().dataset.warnings[known..]);
     note(format_args!("resuming at step {}", run.trainer().clock.step));
     finish(run, args.viewer())
 }
@@ -379,7 +386,7 @@ fn resume(folder: &Path, args: &Args) -> Result<()> {
 fn finish(mut run: Run, viewer: Option<&ListenArgs>) -> Result<()> {
     let folder = run.folder().path().to_owned();
     if let (Some(lpips), Some(path)) = (&run.trainer().options.lpips, &run.request().input().lpips) {
-        lpips::tell(lpips, path);
+        lpips::print_network(lpips, path);
     }
     note(&run.trainer().memory);
     let stop = stop_flag();
@@ -392,11 +399,11 @@ fn finish(mut run: Run, viewer: Option<&ListenArgs>) -> Result<()> {
     let trained = run.train(&mut observers);
     // If Ctrl-C ended the steps, a second one ends the evaluation.
     let stopped = stop.load(Ordering::Relaxed);
-    let asked = stop.clone();
+    let requested = stop.clone();
     let stop = || !stopped && stop.load(Ordering::Relaxed);
     let finished = trained.and_then(|_| run.finish_unless(&stop));
     if matches!(finished, Err(RunError::EvaluationStopped)) {
-        return say(format_args!(
+        return print_line(format_args!(
             "{}; evaluate it with: irradia train --resume {}",
             RunError::EvaluationStopped,
             folder.display()
@@ -409,15 +416,15 @@ fn finish(mut run: Run, viewer: Option<&ListenArgs>) -> Result<()> {
             folder.display()
         )
     })?;
-    tell(&finished)?;
+    print_summary(&finished)?;
     if let Some((viewer, _)) = watched.filter(|(viewer, _)| viewer.is_watched() && !stopped) {
         note("the pages are served until they are closed; Ctrl-C ends the program");
-        viewer.wait_while_watched(&|| asked.load(Ordering::Relaxed));
+        viewer.wait_while_watched(&|| requested.load(Ordering::Relaxed));
     }
     Ok(())
 }
 
-fn tell(finished: &Finished) -> Result<()> {
+fn print_summary(finished: &Finished) -> Result<()> {
     let (report, folder) = (&finished.report, &finished.folder);
     let figures = if report.psnr.is_nan() {
         "nothing was evaluated: there is no held-out view with pixels to measure".to_owned()
@@ -427,8 +434,8 @@ fn tell(finished: &Finished) -> Result<()> {
             report.psnr,
             report.psnr_corrected,
             report.ssim,
-            in_words(report.lpips, report.lpips_net.as_deref()),
-            in_words(report.unseen_lpips, report.unseen_lpips_net.as_deref()),
+            format_lpips(report.lpips, report.lpips_net.as_deref()),
+            format_lpips(report.unseen_lpips, report.unseen_lpips_net.as_deref()),
             report.half_fit_psnr.map_or(String::new(), |psnr| format!(
                 ", {psnr:.2} dB on right halves after a fit on left halves"
             )),
@@ -445,22 +452,22 @@ fn tell(finished: &Finished) -> Result<()> {
             .cloned()
             .collect::<Vec<_>>(),
     );
-    say(format_args!(
+    print_line(format_args!(
         "{figures}; {}, {:.1} s of training",
-        size_in_words(report.splats, report.parameters),
+        format_size(report.splats, report.parameters),
         report.training_seconds
     ))?;
     if !finished.complete {
-        say(format_args!(
+        print_line(format_args!(
             "resume with: irradia train --resume {}",
             folder.path().display()
         ))?;
     }
-    say(format_args!("see {}", folder.file("report.html").display()))
+    print_line(format_args!("see {}", folder.file("report.html").display()))
 }
 
 /// `, LPIPS (alex) 0.1234`, if measured.
-fn in_words(lpips: Option<f64>, net: Option<&str>) -> String {
+fn format_lpips(lpips: Option<f64>, net: Option<&str>) -> String {
     let pair = lpips.zip(net);
     pair.map_or(String::new(), |(lpips, net)| format!(", LPIPS ({net}) {lpips:.4}"))
 }

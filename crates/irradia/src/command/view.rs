@@ -2,7 +2,7 @@
 
 use super::{DataArgs, thread_count, use_threads, warn};
 use crate::interrupt::stop_flag;
-use crate::terminal::{note, say};
+use crate::terminal::{note, print_line};
 use anyhow::Result;
 use irradia_runs::Run;
 use irradia_viewer::{DEFAULT_PORT, Listen, Subject, Viewer, Watcher};
@@ -49,7 +49,7 @@ impl ListenArgs {
             open: self.open,
         };
         let viewer = Viewer::start(subject, &listen, Box::new(|line| note(format_args!("viewer: {line}"))))?;
-        say(format_args!("viewer: {}", viewer.address()))?;
+        print_line(format_args!("viewer: {}", viewer.address()))?;
         Ok(viewer)
     }
 

@@ -174,14 +174,58 @@ fn unusable_images_are_skipped_and_named() {
     }
 }
 
+/// Damages the pixels of a picture, but not its header.
+fn damage(picture: &Path) {
+    let mut bytes = fs::read(picture).expect("a picture");
+    let middle = bytes.len() / 2;
+    bytes[middle..middle + 100].fill(0);
+    fs::write(picture, bytes).expect("damaged");
+}
+
+#[test]
+fn held_out_images_damaged_inside_are_named_and_the_others_are_measured() {
+    let folder = with_data();
+    let here = |name: &str| folder.path().join(name);
+    let [first, second] = ["data/test/r_000.png", "data/test/r_001.png"].map(here);
+    let whole = fs::read(&second).expect("a picture");
+    damage(&second);
+    let line = "train data --out run --steps 6 --set eval_every=2 --set checkpoint_every=3";
+    let ended = irradia(folder.path(), line).success();
+    let warning = "1 of 2 views are not measured, since their photographs cannot be read: test/r_001.png";
+    assert!(ended.stderr.contains(warning), "{ended:?}");
+    let report = || json(&here("run/report.json"));
+    assert_eq!(report()["views"].as_array().map(Vec::len), Some(1));
+    assert!(report()["psnr"].is_f64() && report()["warnings"].to_string().contains(warning));
+    let ended = irradia(folder.path(), "eval run --data data").success();
+    assert!(
+        ended.stdout.contains("mean of 1") && ended.stderr.contains(warning),
+        "{ended:?}"
+    );
+
+    // The restored image is held out again.
+    unfinish(&here("run"), "scene.ply");
+    fs::write(&second, whole).expect("restored");
+    irradia(folder.path(), "train --resume run").success();
+    assert_eq!(report()["views"].as_array().map(Vec::len), Some(2));
+
+    damage(&first);
+    damage(&second);
+    let ended = irradia(folder.path(), "train data --out none --steps 2").success();
+    assert!(ended.stdout.contains("nothing was evaluated"), "{ended:?}");
+    let text = fs::read_to_string(here("none/report.json")).expect("a report");
+    assert!(
+        !text.contains("\"psnr\"") && !text.contains("no view is held out"),
+        "{text}"
+    );
+    irradia(folder.path(), "eval run --data data").refused(1, &["2 of 2 views are not measured", "r_000.png"]);
+    irradia(folder.path(), "train data --out x --steps 2 --until-psnr 9").refused(2, &["--until-psnr"]);
+}
+
 #[test]
 fn an_image_damaged_inside_is_named_and_the_run_resumes_without_it() {
     let folder = with_data();
     let picture = folder.path().join("data/train/r_005.png");
-    let mut bytes = fs::read(&picture).expect("a picture");
-    let middle = bytes.len() / 2;
-    bytes[middle..middle + 100].fill(0);
-    fs::write(&picture, bytes).expect("damaged");
+    damage(&picture);
     irradia(folder.path(), "train data --out run --steps 5").refused(1, &["r_005.png", "remove", "--resume run"]);
     assert_no_leftovers(&folder.path().join("run"));
     fs::remove_file(&picture).expect("removed");
@@ -271,7 +315,7 @@ fn a_path_that_cannot_be_written_is_named() {
 #[test]
 fn a_full_disk_leaves_no_partial_file_and_keeps_existing_ones() {
     let folder = with_run();
-    let limited = |line: &str| -> Ended {
+    let limited = |line: &str| -> ProgramOutput {
         let shell = format!(
             "trap '' XFSZ; ulimit -f 400; exec '{}' {line}",
             env!("CARGO_BIN_EXE_irradia")

@@ -3,12 +3,13 @@
 use crate::process::*;
 use std::fs;
 
-const LINE: &str = "compare data --recipes classic,classic:params.ssim_weight=0.9 --seeds 2 --steps 20 --out both";
+const COMPARE_LINE: &str =
+    "compare data --recipes classic,classic:params.ssim_weight=0.9 --seeds 2 --steps 20 --out both";
 
 #[test]
 fn a_comparison_summarises_its_runs_and_reuses_finished_ones() {
     let folder = with_data();
-    let first = irradia(folder.path(), LINE).success();
+    let first = irradia(folder.path(), COMPARE_LINE).success();
     assert!(
         first.stdout.contains("classic:params.ssim_weight=0.9") && first.stdout.contains(" ± "),
         "{first:?}"
@@ -56,7 +57,7 @@ fn a_comparison_summarises_its_runs_and_reuses_finished_ones() {
     // Only missing runs are trained again.
     fs::remove_dir_all(both.join("data/classic/seed_1")).expect("removed");
     let scene = scene(&both.join("data/classic/seed_0"));
-    let again = irradia(folder.path(), LINE).success();
+    let again = irradia(folder.path(), COMPARE_LINE).success();
     let trained: Vec<&str> = again.stderr.lines().filter(|line| line.ends_with("..")).collect();
     assert_eq!(trained, ["[3/4] data, classic, seed 1 .."], "{again:?}");
     assert!(scene == self::scene(&both.join("data/classic/seed_0")));
@@ -69,16 +70,16 @@ fn a_comparison_summarises_its_runs_and_reuses_finished_ones() {
     let mut changed = json(&request);
     changed["program"] = "another".into();
     fs::write(&request, changed.to_string()).expect("written");
-    irradia(folder.path(), LINE).refused(2, &["seed_0", "another build", "--overwrite"]);
+    irradia(folder.path(), COMPARE_LINE).refused(2, &["seed_0", "another build", "--overwrite"]);
     fs::write(&request, kept).expect("written");
     let picture = folder.path().join("data/train/r_000.png");
     let bytes = fs::read(&picture).expect("a picture");
     fs::copy(folder.path().join("data/train/r_001.png"), &picture).expect("replaced");
-    irradia(folder.path(), LINE).refused(2, &["seed_0", "data that has changed since"]);
+    irradia(folder.path(), COMPARE_LINE).refused(2, &["seed_0", "data that has changed since"]);
     fs::write(&picture, bytes).expect("written");
 
     // Other conditions make another comparison, except with --overwrite.
-    let other = LINE.replace("--steps 20", "--steps 21");
+    let other = COMPARE_LINE.replace("--steps 20", "--steps 21");
     irradia(folder.path(), &other).refused(2, &["other conditions", "--overwrite"]);
     irradia(folder.path(), &(other + " --overwrite")).success();
     assert_eq!(json(&both.join("data/classic/seed_0/report.json"))["steps"], 21);
@@ -178,7 +179,7 @@ fn an_interrupted_comparison_keeps_finished_runs() {
         .args(["-INT", &child.id().to_string()])
         .status();
     assert!(interrupt.expect("kill").success());
-    let ended: Ended = child.wait_with_output().expect("it ends").into();
+    let ended: ProgramOutput = child.wait_with_output().expect("it ends").into();
     let ended = ended.success();
     assert!(ended.stdout.contains("stopped"), "{ended:?}");
     assert!(folder.path().join("both/compare.json").is_file());

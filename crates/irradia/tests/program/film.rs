@@ -1,6 +1,7 @@
 //! Camera paths and films, and the viewer's command line.
 
 use crate::process::*;
+use serde_json::json as value;
 use std::fs;
 use std::net::TcpListener;
 
@@ -23,6 +24,29 @@ fn paths_become_frames_and_films() {
     let film = fs::read(folder.path().join("film.gif")).expect("a film");
     // Width and height, little endian, after the signature.
     assert_eq!((&film[..6], &film[6..10]), (&b"GIF89a"[..], &[41, 0, 30, 0][..]));
+}
+
+#[test]
+fn a_saved_path_shows_the_same_of_a_scene_that_was_moved() {
+    let folder = with_run();
+    let camera = &json(&folder.path().join("run/cameras.json"))[3];
+    let key = value!({ "time": 0, "position": camera["position"], "rotation": camera["rotation"], "fov": 0.8 });
+    let path = value!({ "irradia_path": 1, "fps": 30, "loop": false, "ease": false, "closing": 0, "keys": [key] });
+    fs::write(folder.path().join("path.json"), path.to_string()).expect("written");
+    let edits = ["rotate axis=1,2,3 degrees=70", "scale factor=1.5", "move by=1,-2,0.5"];
+    irradia_with(folder.path(), "edit run -o run/moved.ply", &edits).success();
+    let picture = |scene: &str, out: &str| {
+        let line = format!("render {scene} --path path.json --size 60x40 --out {out}");
+        irradia(folder.path(), &line).success();
+        image::open(folder.path().join(out).join("frame_0000.png"))
+            .expect("a picture")
+            .to_rgb8()
+            .into_raw()
+    };
+    let (before, after) = (picture("run", "before"), picture("run/moved.ply", "after"));
+    let difference: f64 = before.iter().zip(&after).map(|(a, b)| f64::from(a.abs_diff(*b))).sum();
+    // Rotated harmonics differ in their last bits.
+    assert!(difference < 0.5 * before.len() as f64, "{difference}");
 }
 
 #[test]

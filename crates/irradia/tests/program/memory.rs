@@ -27,7 +27,7 @@ fn a_training_that_cannot_fit_is_refused_with_the_memory_that_suffices() {
 fn density_control_stops_at_the_memory_and_says_so() {
     let folder = with_data();
     let train = |out: &str, memory: &str| {
-        let lively = LIVELY.join(" ");
+        let lively = DENSIFYING_ARGS.join(" ");
         let set = "--set stage.grow.density.gradient_threshold=1e-9 --set max_splats=1000000";
         irradia(
             folder.path(),

@@ -77,6 +77,37 @@ fn given_poses_that_photographs_contradict_are_replaced_and_others_are_on_reques
 }
 
 #[test]
+fn views_with_new_poses_are_trained_on_held_out_and_left_out_as_before() {
+    let Some(door) = shared("data/lund_door") else {
+        return;
+    };
+    let folder = tempfile::tempdir().expect("a folder");
+    let here = |name: &str| folder.path().join(name);
+    for part in ["images", "sparse/0"] {
+        copy(&door.join(part), &here("door").join(part), 12);
+    }
+    // The dataset still names it as before.
+    let [old, new] = ["JPG", "jpeg"].map(|extension| here("door/images/DSC_0001").with_extension(extension));
+    fs::rename(old, new).expect("renamed");
+    let names: Vec<String> = (1..=12).map(|i| format!("DSC_{i:04}")).collect();
+    fs::write(here("door/test.txt"), &names[0]).expect("written");
+    fs::write(here("door/train.txt"), names[2..].join("\n")).expect("written");
+    let line = "train door --out run --steps 2 --max-side 120 --poses irradia --overwrite";
+    irradia(folder.path(), line).success();
+    let views = json(&here("run/report.json"))["views"].clone();
+    assert_eq!(views.as_array().map(Vec::len), Some(1), "{views}");
+    assert_eq!(views[0]["name"], "images/DSC_0001.jpeg");
+    assert_eq!(events(&here("run"))[0]["views"], 10);
+
+    // A split without held-out views.
+    fs::remove_file(here("door/test.txt")).expect("removed");
+    fs::write(here("door/train.txt"), names.join("\n")).expect("written");
+    let ended = irradia(folder.path(), line).success();
+    assert!(ended.stdout.contains("nothing was evaluated"), "{ended:?}");
+    assert_eq!(events(&here("run"))[0]["views"], 12);
+}
+
+#[test]
 fn a_training_stops_with_the_reasons_when_too_few_photographs_have_poses() {
     let (Some(door), Some(fern)) = (shared("data/lund_door/images"), shared("data/fern/images_8")) else {
         return;

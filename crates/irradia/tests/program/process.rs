@@ -8,7 +8,7 @@ use std::sync::OnceLock;
 use tempfile::TempDir;
 
 /// Density control within the few steps of a test.
-pub const LIVELY: [&str; 6] = [
+pub const DENSIFYING_ARGS: [&str; 6] = [
     "--recipe",
     "classic",
     "--set",
@@ -19,13 +19,13 @@ pub const LIVELY: [&str; 6] = [
 
 /// Exit status and output of the program.
 #[derive(Debug)]
-pub struct Ended {
+pub struct ProgramOutput {
     pub code: Option<i32>,
     pub stdout: String,
     pub stderr: String,
 }
 
-impl From<Output> for Ended {
+impl From<Output> for ProgramOutput {
     fn from(output: Output) -> Self {
         Self {
             code: output.status.code(),
@@ -35,7 +35,7 @@ impl From<Output> for Ended {
     }
 }
 
-impl Ended {
+impl ProgramOutput {
     /// Asserts success.
     pub fn success(self) -> Self {
         assert_eq!(self.code, Some(0), "{self:#?}");
@@ -71,12 +71,12 @@ pub fn program(folder: &Path) -> Command {
 }
 
 /// Runs the program in `folder`; the words of `line` are its arguments.
-pub fn irradia(folder: &Path, line: &str) -> Ended {
+pub fn irradia(folder: &Path, line: &str) -> ProgramOutput {
     irradia_with(folder, line, &[])
 }
 
 /// Likewise with `more` arguments, which may contain spaces.
-pub fn irradia_with(folder: &Path, line: &str, more: &[&str]) -> Ended {
+pub fn irradia_with(folder: &Path, line: &str, more: &[&str]) -> ProgramOutput {
     let mut command = program(folder);
     command.args(line.split_whitespace()).args(more);
     command.output().expect("the program starts").into()
@@ -84,8 +84,8 @@ pub fn irradia_with(folder: &Path, line: &str, more: &[&str]) -> Ended {
 
 /// A fresh folder with a copy of the small dataset in `data`: 8 training views, 2 held out, 48 x 48.
 pub fn with_data() -> TempDir {
-    static MADE: OnceLock<PathBuf> = OnceLock::new();
-    copied(MADE.get_or_init(|| {
+    static FOLDER: OnceLock<PathBuf> = OnceLock::new();
+    copied(FOLDER.get_or_init(|| {
         let folder = emptied("with_data");
         irradia(&folder, "synth data --views 8 --size 48x48").success();
         folder
@@ -94,11 +94,11 @@ pub fn with_data() -> TempDir {
 
 /// A fresh folder with the small dataset and, in `run`, a run of 60 steps on it.
 pub fn with_run() -> TempDir {
-    static MADE: OnceLock<PathBuf> = OnceLock::new();
-    copied(MADE.get_or_init(|| {
+    static FOLDER: OnceLock<PathBuf> = OnceLock::new();
+    copied(FOLDER.get_or_init(|| {
         let folder = emptied("with_run");
         copy(with_data().path(), &folder);
-        irradia_with(&folder, "train data --out run --steps 60 --seed 7", &LIVELY).success();
+        irradia_with(&folder, "train data --out run --steps 60 --seed 7", &DENSIFYING_ARGS).success();
         folder
     }))
 }

@@ -6,28 +6,28 @@ use std::process::{Child, Command};
 use std::time::{Duration, Instant};
 
 /// Long enough to be interrupted midway, and with everything that could differ: density control, resets, a new view order.
-const LONG: &str = "train data --steps 500 --seed 3 --set checkpoint_every=20";
+const LONG_RUN: &str = "train data --steps 500 --seed 3 --set checkpoint_every=20";
 
-fn unbroken(folder: &Path) -> Vec<u8> {
-    irradia_with(folder, &format!("{LONG} --out unbroken"), &LIVELY).success();
+fn train_uninterrupted(folder: &Path) -> Vec<u8> {
+    irradia_with(folder, &format!("{LONG_RUN} --out unbroken"), &DENSIFYING_ARGS).success();
     scene(&folder.join("unbroken"))
 }
 
 /// Starts the long run and waits for a checkpoint.
-fn caught_in_its_midst(folder: &Path) -> Child {
+fn start_until_checkpoint(folder: &Path) -> Child {
     let mut command = program(folder);
     command
-        .args(LONG.split_whitespace())
+        .args(LONG_RUN.split_whitespace())
         .args(["--out", "run"])
-        .args(LIVELY);
+        .args(DENSIFYING_ARGS);
     let child = command.spawn().expect("the program starts");
     let (checkpoints, started) = (folder.join("run/checkpoints"), Instant::now());
-    let is_there = || {
+    let has_checkpoint = || {
         files_under(&checkpoints)
             .iter()
             .any(|f| f.extension().is_some_and(|e| e == "safetensors"))
     };
-    while !(checkpoints.is_dir() && is_there()) {
+    while !(checkpoints.is_dir() && has_checkpoint()) {
         assert!(started.elapsed() < Duration::from_secs(60), "no checkpoint appears");
         std::thread::sleep(Duration::from_millis(1));
     }
@@ -39,7 +39,7 @@ fn one_thread_and_two_write_the_same_scene() {
     let folder = with_data();
     for threads in [1, 2, 3] {
         let line = format!("train data --out run{threads} --steps 80 --threads {threads}");
-        irradia_with(folder.path(), &line, &LIVELY).success();
+        irradia_with(folder.path(), &line, &DENSIFYING_ARGS).success();
     }
     let one = scene(&folder.path().join("run1"));
     assert!(one == scene(&folder.path().join("run2")) && one == scene(&folder.path().join("run3")));
@@ -70,14 +70,14 @@ fn the_default_recipe_writes_the_same_scene_with_any_threads_and_across_a_resume
 #[test]
 fn a_killed_run_resumes_to_the_bytes_of_an_uninterrupted_one() {
     let folder = with_data();
-    let mut child = caught_in_its_midst(folder.path());
+    let mut child = start_until_checkpoint(folder.path());
     child.kill().expect("killed");
     child.wait().expect("gone");
     let run = folder.path().join("run");
     assert!(!run.join("report.json").exists(), "killed too late to prove anything");
     assert!(!run.join("scene.ply").exists());
     irradia(folder.path(), "train --resume run").success();
-    assert!(scene(&run) == unbroken(folder.path()));
+    assert!(scene(&run) == train_uninterrupted(folder.path()));
     assert_no_leftovers(&run);
     // The journal, too, is that of one run.
     let steps: Vec<u64> = events(&run)
@@ -103,10 +103,10 @@ fn a_run_killed_before_its_first_checkpoint_resumes_from_its_start() {
 #[test]
 fn ctrl_c_saves_everything_and_the_run_resumes_to_the_same_bytes() {
     let folder = with_data();
-    let child = caught_in_its_midst(folder.path());
+    let child = start_until_checkpoint(folder.path());
     let sent = Command::new("kill").args(["-INT", &child.id().to_string()]).status();
     assert!(sent.expect("kill").success());
-    let ended: Ended = child.wait_with_output().expect("ends").into();
+    let ended: ProgramOutput = child.wait_with_output().expect("ends").into();
     let ended = ended.success();
     assert!(ended.stdout.contains("irradia train --resume run"), "{ended:?}");
     let run = folder.path().join("run");
@@ -122,7 +122,7 @@ fn ctrl_c_saves_everything_and_the_run_resumes_to_the_same_bytes() {
 
     irradia(folder.path(), "train --resume run --threads 1").success();
     assert_eq!(json(&run.join("report.json"))["steps"], 500);
-    assert!(scene(&run) == unbroken(folder.path()) && scene(&run) != partial);
+    assert!(scene(&run) == train_uninterrupted(folder.path()) && scene(&run) != partial);
     // A complete run stays unchanged.
     let again = irradia(folder.path(), "train --resume run").success();
     assert!(again.stdout.contains("complete"), "{again:?}");
@@ -131,7 +131,7 @@ fn ctrl_c_saves_everything_and_the_run_resumes_to_the_same_bytes() {
 #[test]
 fn two_processes_do_not_train_into_one_folder() {
     let folder = with_data();
-    let mut child = caught_in_its_midst(folder.path());
+    let mut child = start_until_checkpoint(folder.path());
     let number = child.id().to_string();
     for line in ["train data --out run --overwrite --steps 5", "train --resume run"] {
         irradia(folder.path(), line).refused(1, &["run is in use", &number]);
@@ -170,7 +170,7 @@ fn a_run_with_a_budget_is_repeated_bit_for_bit() {
     irradia_with(
         folder.path(),
         "train data --out run --budget 2s --seed 5 --set render.background=[0.1,0.0,0.0]",
-        &LIVELY,
+        &DENSIFYING_ARGS,
     )
     .success();
     irradia(folder.path(), "train --replay run --out again").success();
@@ -197,7 +197,7 @@ fn after_repeated_kills_it_ends_with_the_same_bytes() {
     let folder = with_data();
     let line = "train data --steps 150 --seed 3 --set checkpoint_every=5";
     let started = Instant::now();
-    irradia_with(folder.path(), &format!("{line} --out unbroken"), &LIVELY).success();
+    irradia_with(folder.path(), &format!("{line} --out unbroken"), &DENSIFYING_ARGS).success();
     let whole = started.elapsed();
     let mut rng = irradia_runs::scene::Rng::new(11, 0);
     let (mut kills, mut tries) = (0, 0);
@@ -209,7 +209,7 @@ fn after_repeated_kills_it_ends_with_the_same_bytes() {
             arguments = "train --resume run".into();
             &[]
         } else {
-            &LIVELY
+            &DENSIFYING_ARGS
         };
         let mut child = program(folder.path())
             .args(arguments.split_whitespace())
@@ -231,7 +231,7 @@ fn after_repeated_kills_it_ends_with_the_same_bytes() {
     if folder.path().join("run/run.json").exists() {
         irradia(folder.path(), "train --resume run").success();
     } else {
-        irradia_with(folder.path(), &format!("{line} --out run"), &LIVELY).success();
+        irradia_with(folder.path(), &format!("{line} --out run"), &DENSIFYING_ARGS).success();
     }
     assert!(scene(&folder.path().join("run")) == scene(&folder.path().join("unbroken")));
     assert_no_leftovers(&folder.path().join("run"));

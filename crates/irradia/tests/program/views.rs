@@ -56,6 +56,39 @@ fn a_number_or_a_list_selects_the_held_out_views() {
 }
 
 #[test]
+fn a_moved_run_resumes_with_its_own_photographs_and_the_views_of_a_list_that_is_gone() {
+    let folder = with_data();
+    let here = |name: &str| folder.path().join(name);
+    fs::create_dir(here("run")).expect("a folder");
+    fs::rename(here("data"), here("run/posed")).expect("moved");
+    fs::write(here("list.txt"), "train/r_001\n").expect("written");
+    let line = "train run/posed --out run --steps 40 --set checkpoint_every=20 --holdout list.txt";
+    irradia(folder.path(), line).success();
+    let before = fs::read(here("run/scene.ply")).expect("a scene");
+    fs::rename(here("run"), here("moved")).expect("moved");
+    fs::rename(here("list.txt"), here("other.txt")).expect("moved");
+    for option in ["", "--holdout other.txt"] {
+        unfinish(&here("moved"), "scene.ply");
+        irradia(folder.path(), &format!("train --resume moved {option}")).success();
+        assert!(
+            fs::read(here("moved/scene.ply")).expect("a scene") == before,
+            "{option}"
+        );
+        assert_eq!(held_out(&here("moved")), ["train/r_001.png"], "{option}");
+    }
+    fs::remove_file(here("other.txt")).expect("removed");
+    let ended = irradia(folder.path(), "eval moved --data moved/posed").success();
+    assert!(
+        ended.stdout.contains("train/r_001.png") && ended.stdout.contains("mean of 1"),
+        "{ended:?}"
+    );
+    irradia(folder.path(), "train --replay moved --out again").success();
+    assert_eq!(held_out(&here("again")), ["train/r_001.png"]);
+    unfinish(&here("moved"), "scene.ply");
+    irradia(folder.path(), "train --resume moved --holdout 5").refused(2, &["--holdout 5", "other views"]);
+}
+
+#[test]
 fn a_dataset_without_its_training_images_is_rejected() {
     let folder = with_data();
     // There are enough held-out views to train on, if that were allowed.

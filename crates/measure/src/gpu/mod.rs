@@ -52,7 +52,7 @@ pub struct DeviceFrame<'a> {
 
 /// The terms of the loss other than colours.
 #[derive(Clone, Copy, Debug)]
-pub struct Beside<'a> {
+pub struct ExtraTerms<'a> {
     /// Known depths in world units; those that are not positive and finite, or are outside the image, do not count.
     pub depths: &'a [DepthSample],
     /// Weight of their loss.
@@ -123,9 +123,9 @@ impl GpuLoss {
         frame: &DeviceFrame,
         target: &Target,
         weights: &LossWeights,
-        beside: &Beside,
+        extra: &ExtraTerms,
     ) -> DeviceValues {
-        self.begin(frame, target, weights, beside);
+        self.begin(frame, target, weights, extra);
         self.finish()
     }
 
@@ -133,7 +133,7 @@ impl GpuLoss {
     ///
     /// # Panics
     /// When the truth is not 8-bit, or its length differs from the target's size: a bug in the caller.
-    pub fn begin(&mut self, frame: &DeviceFrame, target: &Target, weights: &LossWeights, beside: &Beside) {
+    pub fn begin(&mut self, frame: &DeviceFrame, target: &Target, weights: &LossWeights, extra: &ExtraTerms) {
         let gpu = &*self.gpu;
         let (width, height) = (target.width, target.height);
         let Truth::Rgb8(truth) = target.truth else {
@@ -150,9 +150,9 @@ impl GpuLoss {
         let flags = flags(&[
             (target.mask.is_some(), flag::MASK),
             (weights.ssim != 0.0, flag::SSIM),
-            (beside.error, flag::ERROR),
+            (extra.error, flag::ERROR),
         ]);
-        let samples = packed(beside.depths, width * height);
+        let samples = packed(extra.depths, width * height);
         self.samples.reserve(gpu, samples.len());
         self.samples.write(gpu, 0, &samples);
         // With nothing to compare, gradients are zero.
@@ -160,20 +160,14 @@ impl GpuLoss {
             true => Gains::of(weights, count),
             false => Gains::NONE,
         };
-        let gains = [
-            gains.l1 as f32,
-            gains.ssim as f32,
-            gains.mse as f32,
-            beside.depth_weight,
-        ]
-        .map(f32::to_bits);
+        let gains = [gains.l1 as f32, gains.ssim as f32, gains.mse as f32, extra.depth_weight].map(f32::to_bits);
         let sizes = [
             width as u32,
             height as u32,
             tiles[0] as u32,
             (tiles[0] * tiles[1]) as u32,
         ];
-        let cover = beside.cover_weight / (width * height).max(1) as f32;
+        let cover = extra.cover_weight / (width * height).max(1) as f32;
         let more = [flags, samples.len() as u32 / 3, cover.to_bits(), 0];
         self.task.write(gpu, 0, &[sizes, gains, more]);
         self.maps.reserve(gpu, 9 * width * height);
@@ -357,13 +351,13 @@ mod tests {
                     planes: &Array::of(&gpu, "frame", &planes),
                     v_planes: &Array::of(&gpu, "gradients", &vec![9.0f32; 6 * pixels]),
                 };
-                let beside = Beside {
+                let extra = ExtraTerms {
                     depths: &samples,
                     depth_weight: 0.7,
                     cover_weight: 0.3,
                     error: true,
                 };
-                let got = loss.evaluate(&frame, &target, &weights, &beside);
+                let got = loss.evaluate(&frame, &target, &weights, &extra);
                 let near =
                     |a: f64, b: f64, what: &str| assert!((a - b).abs() < 1e-5 * b.abs().max(1.0), "{what}: {a} {b}");
                 near(got.photometric.total, values.total, "total");

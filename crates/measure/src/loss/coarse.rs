@@ -222,7 +222,7 @@ mod tests {
     use super::super::{LossWeights, PhotometricLoss, Truth};
     use super::*;
     use irradia_compute::simd::Double;
-    use irradia_testkit::differences::{Differences, some_of};
+    use irradia_testkit::finite_differences::{FiniteDifferences, sample_indices};
 
     fn in_double(picture: &Picture, render: &[f64], factor: usize) -> (f64, Vec<f64>) {
         let mut v = vec![0.0; render.len()];
@@ -268,7 +268,13 @@ mod tests {
                 let (_, v) = in_double(&picture, &picture.render, factor);
                 // Quadratic: central differences are exact up to rounding.
                 let value = |render: &[f64]| in_double(&picture, render, factor).0;
-                Differences::of_largest(1e-4, 1e-7).check("coarse", &picture.render, &v, some_of(v.len()), value);
+                FiniteDifferences::relative_to_max(1e-4, 1e-7).check(
+                    "coarse",
+                    &picture.render,
+                    &v,
+                    sample_indices(v.len()),
+                    value,
+                );
             }
         }
     }

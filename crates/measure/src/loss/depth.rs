@@ -225,7 +225,7 @@ impl Fit {
 mod tests {
     use super::*;
     use irradia_scene::Rng;
-    use irradia_testkit::differences::{Differences, some_of};
+    use irradia_testkit::finite_differences::{FiniteDifferences, sample_indices};
 
     const PIXELS: usize = 60;
 
@@ -275,11 +275,11 @@ mod tests {
                 }
                 assert!(values.samples > 10 && values.loss > 0.0);
                 // For these seeds no residual lies within a step of its kink, and no alpha within a step of the threshold.
-                let differences = Differences::of_largest(1e-6, 1e-6);
+                let differences = FiniteDifferences::relative_to_max(1e-6, 1e-6);
                 let by_depth = |d: &[f64]| value(d, &alpha, &samples, kind).0.loss;
-                differences.check("depth", &depth, &v_depth, some_of(depth.len()), by_depth);
+                differences.check("depth", &depth, &v_depth, sample_indices(depth.len()), by_depth);
                 let by_alpha = |a: &[f64]| value(&depth, a, &samples, kind).0.loss;
-                differences.check("alpha", &alpha, &v_alpha, some_of(alpha.len()), by_alpha);
+                differences.check("alpha", &alpha, &v_alpha, sample_indices(alpha.len()), by_alpha);
             }
         }
     }

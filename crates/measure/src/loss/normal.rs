@@ -15,7 +15,7 @@ use irradia_compute::simd::Scalar;
 use irradia_scene::Intrinsics;
 
 /// A sample is at a depth edge if two opposite depths differ by more than this fraction of the smaller one.
-const EDGE: f64 = 0.2;
+const EDGE_THRESHOLD: f64 = 0.2;
 
 /// The known normal at a pixel.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -124,7 +124,7 @@ impl NormalLoss {
                 return None;
             }
         }
-        let is_edge = |a: f64, b: f64| (a - b).abs() > EDGE * a.min(b);
+        let is_edge = |a: f64, b: f64| (a - b).abs() > EDGE_THRESHOLD * a.min(b);
         let ray = |[x, y]: [u32; 2]| camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5)).as_dvec3();
         let given = DVec3::from_array(sample.normal.map(f64::from));
         let counts = !is_edge(depths[0], depths[1]) && !is_edge(depths[2], depths[3]) && given.is_finite();
@@ -176,7 +176,7 @@ impl Stencil {
 mod tests {
     use super::*;
     use irradia_scene::Rng;
-    use irradia_testkit::differences::{Differences, some_of};
+    use irradia_testkit::finite_differences::{FiniteDifferences, sample_indices};
 
     const SIDE: u32 = 12;
 
@@ -243,11 +243,11 @@ mod tests {
         let (loss, [v_depth, v_alpha]) = value(&depth, &alpha, &given);
         assert!(loss > 0.05, "{loss}");
         // For this seed no sample is within a step of an edge, and no opacity within a step of the threshold.
-        let differences = Differences::of_largest(1e-6, 1e-5);
+        let differences = FiniteDifferences::relative_to_max(1e-6, 1e-5);
         let by_depth = |d: &[f64]| value(d, &alpha, &given).0;
-        differences.check("depth", &depth, &v_depth, some_of(depth.len()), by_depth);
+        differences.check("depth", &depth, &v_depth, sample_indices(depth.len()), by_depth);
         let by_alpha = |a: &[f64]| value(&depth, a, &given).0;
-        differences.check("alpha", &alpha, &v_alpha, some_of(alpha.len()), by_alpha);
+        differences.check("alpha", &alpha, &v_alpha, sample_indices(alpha.len()), by_alpha);
     }
 
     #[test]

@@ -127,7 +127,7 @@ mod tests {
     use super::super::Truth;
     use super::super::picture::Picture;
     use super::*;
-    use irradia_testkit::differences::directional;
+    use irradia_testkit::finite_differences::check_directional;
     use irradia_testkit::shared;
 
     const WEIGHTS: &str = "data/lpips/lpips_squeeze.safetensors";
@@ -157,7 +157,7 @@ mod tests {
                     let crop = crop(&picture);
                     let (_, v) = evaluate(&network, &picture, &picture.render, crop);
                     let value = |render: &[f64]| evaluate(&network, &picture, render, crop).0;
-                    directional(&picture.render, &v, value, 1e-7, 1e-5);
+                    check_directional(&picture.render, &v, value, 1e-7, 1e-5);
                 }
             }
         }

@@ -89,7 +89,7 @@ struct Memory<T> {
 }
 
 /// Largest sum of three channels' 8-bit differences.
-const LARGEST: usize = 3 * 255;
+const MAX_DIFFERENCE: usize = 3 * 255;
 
 impl<T: Real> Memory<T> {
     fn evaluate(
@@ -110,8 +110,8 @@ impl<T: Real> Memory<T> {
         self.slopes.resize(2 * width * height, T::zero());
         self.sums.resize(height, 0.0);
         self.edges.clear();
-        let weight = |i| T::from_f64((-knobs.k * f64::from(i) / LARGEST as f64).exp());
-        self.edges.extend((0..=LARGEST as u16).map(weight));
+        let weight = |i| T::from_f64((-knobs.k * f64::from(i) / MAX_DIFFERENCE as f64).exp());
+        self.edges.extend((0..=MAX_DIFFERENCE as u16).map(weight));
         if width * height == 0 {
             return 0.0;
         }
@@ -184,7 +184,7 @@ impl<T: Real> Memory<T> {
 
 /// q of a row, and its sum.
 fn quantities<T: Real>(depth: &[T], alpha: &[T], mask: Option<&[u8]>, knobs: &Knobs, q: &mut [T]) -> f64 {
-    let least = T::from_f64(f64::from(knobs.min_alpha)).max(T::min_positive_value());
+    let min_alpha = T::from_f64(f64::from(knobs.min_alpha)).max(T::min_positive_value());
     let mut sum = 0.0;
     for x in 0..q.len() {
         let quantity = match knobs.of {
@@ -192,7 +192,7 @@ fn quantities<T: Real>(depth: &[T], alpha: &[T], mask: Option<&[u8]>, knobs: &Kn
             Smoothed::Depth => depth[x] / alpha[x],
         };
         let counts =
-            alpha[x] >= least && depth[x] > T::zero() && quantity.is_finite() && mask.is_none_or(|m| m[x] != 0);
+            alpha[x] >= min_alpha && depth[x] > T::zero() && quantity.is_finite() && mask.is_none_or(|m| m[x] != 0);
         q[x] = if counts { quantity } else { T::zero() };
         sum += q[x].to_f64();
     }
@@ -231,7 +231,7 @@ mod tests {
     use super::super::picture::Picture;
     use super::*;
     use irradia_scene::Rng;
-    use irradia_testkit::differences::{Differences, some_of};
+    use irradia_testkit::finite_differences::{FiniteDifferences, sample_indices};
 
     fn knobs(of: Smoothed, k: f64) -> Knobs {
         Knobs {
@@ -268,10 +268,10 @@ mod tests {
                     let (_, [v_depth, v_alpha]) = value(&depth, &alpha, &target, &knobs);
                     // For these seeds no two neighbours are within a step of each other, and no alpha within a step of the threshold.
                     let by_depth = |depth: &[f64]| value(depth, &alpha, &target, &knobs).0;
-                    let differences = Differences::of_largest(1e-7, 1e-6);
-                    differences.check("depth", &depth, &v_depth, some_of(depth.len()), by_depth);
+                    let differences = FiniteDifferences::relative_to_max(1e-7, 1e-6);
+                    differences.check("depth", &depth, &v_depth, sample_indices(depth.len()), by_depth);
                     let by_alpha = |alpha: &[f64]| value(&depth, alpha, &target, &knobs).0;
-                    differences.check("alpha", &alpha, &v_alpha, some_of(alpha.len()), by_alpha);
+                    differences.check("alpha", &alpha, &v_alpha, sample_indices(alpha.len()), by_alpha);
                 }
             }
         }

@@ -10,7 +10,7 @@
 //! The gradient of its sum is `G a + x (G b) + y (G c)`, with a, b / 2 and c the derivatives with respect to mu_x, G s and
 //! G p (stored halved): with zeros beyond the border the window is its own adjoint.
 //!
-//! Each step loads [`STEP`] rows, finishes the maps of the rows [`RADIUS`] above them and the gradient of the rows twice that far
+//! Each step loads [`ROWS_PER_STEP`] rows, finishes the maps of the rows [`RADIUS`] above them and the gradient of the rows twice that far
 //! above, so that rings of 16 rows, which stay in the cache, suffice. It handles four rows at a time, since 14 loads then serve
 //! 4 windows along y, whereas a single row takes 11 loads for one.
 
@@ -21,11 +21,11 @@ use crate::window::{C1, C2, RADIUS, TAPS, half_window};
 use irradia_compute::simd::{Lanes, Scalar, Simd};
 
 /// Rows per step.
-const STEP: usize = 4;
+const ROWS_PER_STEP: usize = 4;
 /// Rows covered by the windows of a step's rows.
-const SEEN: usize = STEP + 2 * RADIUS;
-/// Rows in a ring, a power of two not below `SEEN`.
-const RING: usize = 16;
+const WINDOW_ROWS: usize = ROWS_PER_STEP + 2 * RADIUS;
+/// Rows in a ring, a power of two not below `WINDOW_ROWS`.
+const RING_ROWS: usize = 16;
 /// Rows of a ring of moments per image row: x, y, m, s, p.
 const MOMENTS: usize = 5;
 const X: usize = 0;
@@ -37,13 +37,13 @@ const P: usize = 4;
 /// The working memory of one band.
 #[derive(Default)]
 pub(super) struct Scratch<T> {
-    /// Rings of x, y, m, s, p, `[RING, MOMENTS]` rows.
+    /// Rings of x, y, m, s, p, `[RING_ROWS, MOMENTS]` rows.
     pub(super) moments: Rows<T>,
-    /// Window along y of x, y, s, p, `[4, STEP]` rows.
+    /// Window along y of x, y, s, p, `[4, ROWS_PER_STEP]` rows.
     blurred: Rows<T>,
     /// Derivatives a, b, c of one row.
     derivatives: Rows<T>,
-    /// Rings of a, b, c after the window along x, `[RING, 3]` rows.
+    /// Rings of a, b, c after the window along x, `[RING_ROWS, 3]` rows.
     adjoint: Rows<T>,
     /// Gradient of a step's rows.
     gradient: Rows<T>,
@@ -51,11 +51,11 @@ pub(super) struct Scratch<T> {
 
 impl<T: Scalar> Scratch<T> {
     pub(super) fn reshape(&mut self, width: usize) {
-        self.moments.reshape(RING * MOMENTS, width);
-        self.blurred.reshape(STEP * 4, width);
+        self.moments.reshape(RING_ROWS * MOMENTS, width);
+        self.blurred.reshape(ROWS_PER_STEP * 4, width);
         self.derivatives.reshape(3, width);
-        self.adjoint.reshape(RING * 3, width);
-        self.gradient.reshape(STEP, width);
+        self.adjoint.reshape(RING_ROWS * 3, width);
+        self.gradient.reshape(ROWS_PER_STEP, width);
     }
 }
 
@@ -76,34 +76,34 @@ pub(super) fn band<S: Simd>(
     }
     let mut sums = Sums::default();
     // Rows are numbered such that the first row the band reads, possibly above the image, is RING.
-    let first = RING + 2 * RADIUS;
+    let first = RING_ROWS + 2 * RADIUS;
     let last = first + job.rows.len();
     let image_row = |row: usize| {
         (job.rows.start + row)
             .checked_sub(first)
             .filter(|row| *row < job.height)
     };
-    for step in (RING..last + 2 * RADIUS).step_by(STEP) {
-        for row in step..step + STEP {
-            load_row(simd, job, image_row(row), &mut scratch.moments, row % RING);
+    for step in (RING_ROWS..last + 2 * RADIUS).step_by(ROWS_PER_STEP) {
+        for row in step..step + ROWS_PER_STEP {
+            load_row(simd, job, image_row(row), &mut scratch.moments, row % RING_ROWS);
         }
         // Rows whose windows begin before the band's first row are computed but not used.
-        if step + STEP >= RING + 2 * RADIUS {
+        if step + ROWS_PER_STEP >= RING_ROWS + 2 * RADIUS {
             blur_moments(simd, scratch, &window, step);
-            for i in 0..STEP {
+            for i in 0..ROWS_PER_STEP {
                 let row = step + i - RADIUS;
-                let dissimilarity = differentiate(simd, scratch, &window, i, row % RING);
+                let dissimilarity = differentiate(simd, scratch, &window, i, row % RING_ROWS);
                 if (first..last).contains(&row) {
                     sums.dissimilarity += dissimilarity;
                 }
-                blur_derivatives(simd, scratch, &window, row % RING);
+                blur_derivatives(simd, scratch, &window, row % RING_ROWS);
             }
         }
         if step >= first + 2 * RADIUS {
             let above = step - 2 * RADIUS;
-            let rows = above..(above + STEP).min(last);
+            let rows = above..(above + ROWS_PER_STEP).min(last);
             finish(simd, job, scratch, &window, above, rows.len(), &mut sums);
-            let out: [&mut [ScalarOf<S>]; STEP] = scratch.gradient.columns_mut(0);
+            let out: [&mut [ScalarOf<S>]; ROWS_PER_STEP] = scratch.gradient.columns_mut(0);
             for (row, gradient) in rows.zip(out) {
                 let at = (row - first) * job.width;
                 v_render[at..at + job.width].copy_from_slice(&gradient[..job.width]);
@@ -144,18 +144,18 @@ fn load_row<S: Simd>(
     }
 }
 
-/// The window along y of the four moments, for the [`STEP`] rows whose last window ends in the step's last row.
+/// The window along y of the four moments, for the [`ROWS_PER_STEP`] rows whose last window ends in the step's last row.
 #[inline(always)]
 fn blur_moments<S: Simd>(simd: S, scratch: &mut Scratch<ScalarOf<S>>, window: &Window<S::F>, step: usize) {
     for (i, moment) in [X, Y, S_, P].into_iter().enumerate() {
-        let seen = seen(&scratch.moments, step - 2 * RADIUS, MOMENTS, moment);
-        let blocks = seen[0].len();
-        let out: [&mut [ScalarOf<S>]; STEP] = scratch.blurred.columns_mut(i * STEP);
+        let window_rows = window_rows(&scratch.moments, step - 2 * RADIUS, MOMENTS, moment);
+        let blocks = window_rows[0].len();
+        let out: [&mut [ScalarOf<S>]; ROWS_PER_STEP] = scratch.blurred.columns_mut(i * ROWS_PER_STEP);
         let out = out.map(|row| &mut row.as_chunks_mut::<BLOCK>().0[..blocks]);
         for block in 0..blocks {
             for at in (0..BLOCK).step_by(S::LANES) {
-                let values = along_y(simd, &seen, block, at, window);
-                for row in 0..STEP {
+                let values = along_y(simd, &window_rows, block, at, window);
+                for row in 0..ROWS_PER_STEP {
                     values[row].store(&mut out[row][block][at..]);
                 }
             }
@@ -163,12 +163,12 @@ fn blur_moments<S: Simd>(simd: S, scratch: &mut Scratch<ScalarOf<S>>, window: &W
     }
 }
 
-/// The rows `first..first + SEEN` of part `part` of a ring of `parts`, all of one length.
+/// The rows `first..first + WINDOW_ROWS` of part `part` of a ring of `parts`, all of one length.
 #[inline(always)]
-fn seen<T: Scalar>(ring: &Rows<T>, first: usize, parts: usize, part: usize) -> [&[[T; BLOCK]]; SEEN] {
-    let row = |k: usize| ring.blocks((first + k) % RING * parts + part);
+fn window_rows<T: Scalar>(ring: &Rows<T>, first: usize, parts: usize, part: usize) -> [&[[T; BLOCK]]; WINDOW_ROWS] {
+    let row = |k: usize| ring.blocks((first + k) % RING_ROWS * parts + part);
     let blocks = row(0).len();
-    let mut rows: [&[[T; BLOCK]]; SEEN] = [&[]; SEEN];
+    let mut rows: [&[[T; BLOCK]]; WINDOW_ROWS] = [&[]; WINDOW_ROWS];
     for (k, slot) in rows.iter_mut().enumerate() {
         // The compiler must see that the lengths are equal, or it checks every load.
         *slot = &row(k)[..blocks];
@@ -176,21 +176,21 @@ fn seen<T: Scalar>(ring: &Rows<T>, first: usize, parts: usize, part: usize) -> [
     rows
 }
 
-/// The window along y at one vector of [`STEP`] rows.
+/// The window along y at one vector of [`ROWS_PER_STEP`] rows.
 #[inline(always)]
 fn along_y<S: Simd>(
     simd: S,
-    rows: &[&[[ScalarOf<S>; BLOCK]]; SEEN],
+    rows: &[&[[ScalarOf<S>; BLOCK]]; WINDOW_ROWS],
     block: usize,
     at: usize,
     window: &Window<S::F>,
-) -> [S::F; STEP] {
-    let mut values = [simd.splat(0.0); SEEN];
-    for k in 0..SEEN {
+) -> [S::F; ROWS_PER_STEP] {
+    let mut values = [simd.splat(0.0); WINDOW_ROWS];
+    for k in 0..WINDOW_ROWS {
         values[k] = simd.load(&rows[k][block][at..]);
     }
-    let mut out = [simd.splat(0.0); STEP];
-    for i in 0..STEP {
+    let mut out = [simd.splat(0.0); ROWS_PER_STEP];
+    for i in 0..ROWS_PER_STEP {
         let mut sum = values[i + RADIUS] * window[0];
         for k in 1..=RADIUS {
             sum = (values[i + RADIUS - k] + values[i + RADIUS + k]).mul_add(window[k], sum);
@@ -204,10 +204,10 @@ fn along_y<S: Simd>(
 #[inline(always)]
 fn along_x<S: Simd>(simd: S, padded: &[ScalarOf<S>], column: usize, window: &Window<S::F>) -> S::F {
     let from = BLOCK + column - RADIUS;
-    let seen = &padded[from..from + TAPS - 1 + S::LANES];
-    let mut sum = simd.load(&seen[RADIUS..]) * window[0];
+    let span = &padded[from..from + TAPS - 1 + S::LANES];
+    let mut sum = simd.load(&span[RADIUS..]) * window[0];
     for k in 1..=RADIUS {
-        let pair = simd.load(&seen[RADIUS - k..]) + simd.load(&seen[RADIUS + k..]);
+        let pair = simd.load(&span[RADIUS - k..]) + simd.load(&span[RADIUS + k..]);
         sum = pair.mul_add(window[k], sum);
     }
     sum
@@ -223,7 +223,7 @@ fn differentiate<S: Simd>(
     i: usize,
     slot: usize,
 ) -> f64 {
-    let [x, y, s, p] = [0, 1, 2, 3].map(|part| scratch.blurred.padded(part * STEP + i));
+    let [x, y, s, p] = [0, 1, 2, 3].map(|part| scratch.blurred.padded(part * ROWS_PER_STEP + i));
     let weights = scratch.moments.blocks(slot * MOMENTS + M);
     let [a, b, c]: [&mut [ScalarOf<S>]; 3] = scratch.derivatives.columns_mut(0);
     let blocks = weights.len();
@@ -286,21 +286,21 @@ fn finish<S: Simd>(
     let [gain_l1, gain_ssim, gain_mse] =
         [job.gains.l1, 2.0 * job.gains.ssim, job.gains.mse].map(|gain| simd.splat(gain));
     let blocks = scratch.adjoint.blocks(0).len();
-    let derivatives = [0, 1, 2].map(|part| seen(&scratch.adjoint, above - RADIUS, 3, part));
-    let out: [&mut [ScalarOf<S>]; STEP] = scratch.gradient.columns_mut(0);
+    let derivatives = [0, 1, 2].map(|part| window_rows(&scratch.adjoint, above - RADIUS, 3, part));
+    let out: [&mut [ScalarOf<S>]; ROWS_PER_STEP] = scratch.gradient.columns_mut(0);
     let out = out.map(|row| &mut row.as_chunks_mut::<BLOCK>().0[..blocks]);
-    let mut pixel_rows = [[derivatives[0][0]; 3]; STEP];
+    let mut pixel_rows = [[derivatives[0][0]; 3]; ROWS_PER_STEP];
     for (i, rows) in pixel_rows.iter_mut().enumerate() {
-        let slot = (above + i) % RING * MOMENTS;
+        let slot = (above + i) % RING_ROWS * MOMENTS;
         *rows = [X, Y, M].map(|moment| &scratch.moments.blocks(slot + moment)[..blocks]);
     }
-    let mut differences = [Differences::zero(simd); STEP];
+    let mut differences = [Differences::zero(simd); ROWS_PER_STEP];
     for block in 0..blocks {
         for at in (0..BLOCK).step_by(S::LANES) {
             let a = along_y(simd, &derivatives[0], block, at, window);
             let b = along_y(simd, &derivatives[1], block, at, window);
             let c = along_y(simd, &derivatives[2], block, at, window);
-            for i in 0..STEP {
+            for i in 0..ROWS_PER_STEP {
                 // Not `map`: the compiler does not inline it into code for wider instructions.
                 let [x, y, m] = &pixel_rows[i];
                 let (x, y) = (simd.load(&x[block][at..]), simd.load(&y[block][at..]));

@@ -2,7 +2,7 @@ use super::picture::Picture;
 use super::*;
 use crate::metric;
 use irradia_compute::simd::Double;
-use irradia_testkit::differences::{Differences, some_of};
+use irradia_testkit::finite_differences::{FiniteDifferences, sample_indices};
 
 const MIXED: LossWeights = LossWeights {
     l1: 0.7,
@@ -78,13 +78,13 @@ fn gradients_match_finite_differences() {
                 let smooth = |i: &usize| (case.render[*i] - case.truth[*i]).abs() >= 2.0 * STEP;
                 // Truncation error is STEP^2 times the third derivative over the gradient; SSIM's constants are 1e-3,
                 // so 1e-5 of the largest gradient; 1e-10 is the rounding of a loss near 1 over 2 STEP.
-                let differences = Differences {
+                let differences = FiniteDifferences {
                     absolute: 1e-10,
-                    ..Differences::of_largest(STEP, 1e-5)
+                    ..FiniteDifferences::relative_to_max(STEP, 1e-5)
                 };
                 let what = format!("{width}x{height} masked {masked} {weights:?}");
                 let value = |render: &[f64]| case.in_double(render, &weights).0.total;
-                let which = some_of(v_render.len()).filter(smooth);
+                let which = sample_indices(v_render.len()).filter(smooth);
                 differences.check(&what, &case.render, &v_render, which, value);
             }
         }

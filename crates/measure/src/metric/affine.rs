@@ -61,7 +61,7 @@ impl Affine {
             }
             count += 1;
         }
-        if count < LEAST_PIXELS {
+        if count < MIN_PIXELS {
             return Self::IDENTITY;
         }
         // An image of one colour does not determine the map: a weight far below any signal then favours the identity.
@@ -83,7 +83,7 @@ impl Affine {
 }
 
 /// Minimum number of pixels to fit a map.
-const LEAST_PIXELS: usize = 64;
+const MIN_PIXELS: usize = 64;
 /// Weight of the identity, in units of squared colour per pixel: a hundredth of a grey level.
 const RIDGE: f64 = 1.6e-9;
 

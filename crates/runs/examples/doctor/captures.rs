@@ -10,7 +10,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Names of real captures, and the folders of their photographs.
-const REAL: [(&str, &str); 7] = [
+const REAL_CAPTURES: [(&str, &str); 7] = [
     ("fox", "fox/images"),
     ("maryRose", "maryRose/images_4"),
     ("cup", "cup/images"),
@@ -20,10 +20,10 @@ const REAL: [(&str, &str); 7] = [
     ("can", "can/images"),
 ];
 /// Size of ray-traced photographs, px, and their field of view, radians.
-const SIZE: [u32; 2] = [480, 360];
-const FOV: f32 = 0.9;
+const PHOTO_SIZE: [u32; 2] = [480, 360];
+const FOV_RADIANS: f32 = 0.9;
 /// Number of photographs around a ray-traced scene.
-const RING: usize = 48;
+const RING_PHOTOS: usize = 48;
 
 /// An RGB image.
 #[derive(Clone)]
@@ -78,7 +78,10 @@ pub enum Expected {
 
 /// All captures, clean ones first.
 pub fn all() -> Vec<Capture> {
-    let real: Vec<Source> = REAL.iter().map(|(name, path)| Source::Real(name, path)).collect();
+    let real: Vec<Source> = REAL_CAPTURES
+        .iter()
+        .map(|(name, path)| Source::Real(name, path))
+        .collect();
     let rings = [
         Source::Ring(SceneName::Demo, 1),
         Source::Ring(SceneName::Thin, 2),
@@ -147,7 +150,7 @@ impl Capture {
         let expected = match self.injury {
             "blur" => {
                 for (turn, i) in tenth.iter().enumerate() {
-                    pictures[*i] = pictures[*i].smeared(turn);
+                    pictures[*i] = pictures[*i].motion_blurred(turn);
                 }
                 Expected::Photographs {
                     kind: "blurred",
@@ -156,7 +159,7 @@ impl Capture {
             }
             "exposure" => {
                 for (turn, i) in tenth.iter().enumerate() {
-                    pictures[*i].expose(if turn % 2 == 0 { 3.0 } else { -3.0 });
+                    pictures[*i].change_exposure(if turn % 2 == 0 { 3.0 } else { -3.0 });
                 }
                 Expected::Photographs {
                     kind: "exposure",
@@ -171,15 +174,15 @@ impl Capture {
                 Expected::Capture { kinds: &["zoom"] }
             }
             "cut" => {
-                pictures = pictures.iter().map(|picture| picture.cut(0.75)).collect();
+                pictures = pictures.iter().map(|picture| picture.cropped(0.75)).collect();
                 Expected::Capture { kinds: &["cut"] }
             }
             "gap" => {
-                kept.retain(|i| !(7..7 + 60 * RING / 360).contains(i));
+                kept.retain(|i| !(7..7 + 60 * RING_PHOTOS / 360).contains(i));
                 Expected::Capture { kinds: &["gap"] }
             }
             "loop" => {
-                kept.retain(|i| *i < RING - 4);
+                kept.retain(|i| *i < RING_PHOTOS - 4);
                 Expected::Capture { kinds: &["open-loop"] }
             }
             "rotation" => Expected::Capture {
@@ -188,7 +191,7 @@ impl Capture {
             "turntable" => {
                 let behind = Picture::noise(pictures[0].width, pictures[0].height, 99);
                 for (picture, background) in pictures.iter_mut().zip(self.source.backgrounds()?) {
-                    picture.put_behind(&behind, &background);
+                    picture.replace_background(&behind, &background);
                 }
                 Expected::Capture {
                     kinds: &["stands-still"],
@@ -197,7 +200,7 @@ impl Capture {
             "moving" => {
                 for picture in &mut pictures {
                     if rng.uniform() < 0.7 {
-                        picture.stand_in_the_way(&mut rng);
+                        picture.add_person(&mut rng);
                     }
                 }
                 Expected::Capture { kinds: &["moving"] }
@@ -208,7 +211,6 @@ impl Capture {
             _ => Expected::Nothing { photographs: n },
         };
         if !folder.exists() {
-            fs::create_dir_all(folder)?;
             for i in kept {
                 let picture = &pictures[i];
                 write_png(
@@ -246,17 +248,17 @@ impl Source {
         Ok(cameras
             .iter()
             .enumerate()
-            .map(|(i, camera)| traced(&scene, camera, i))
+            .map(|(i, camera)| render_picture(&scene, camera, i))
             .collect())
     }
 
     fn scene(self) -> (SynthScene, Vec<Camera>) {
-        let camera = |pose: Pose| Camera::new(pose, Intrinsics::from_fov_x(SIZE[0], SIZE[1], FOV));
+        let camera = |pose: Pose| Camera::new(pose, Intrinsics::from_fov_x(PHOTO_SIZE[0], PHOTO_SIZE[1], FOV_RADIANS));
         match self {
             Source::Ring(name, seed) => {
                 let scene = name.build(seed).0;
-                let around = (0..RING).map(|i| {
-                    let azimuth = std::f32::consts::TAU * i as f32 / RING as f32;
+                let around = (0..RING_PHOTOS).map(|i| {
+                    let azimuth = std::f32::consts::TAU * i as f32 / RING_PHOTOS as f32;
                     let away = Vec3::new(azimuth.cos(), azimuth.sin(), 0.45 + 0.1 * (3.0 * azimuth).sin());
                     camera(Pose::look_at(4.0 * away, Vec3::Z * 0.3, Vec3::Z))
                 });
@@ -307,11 +309,11 @@ fn shared(path: &str) -> PathBuf {
         .join(path)
 }
 
-fn traced(scene: &SynthScene, camera: &Camera, seed: usize) -> Picture {
+fn render_picture(scene: &SynthScene, camera: &Camera, seed: usize) -> Picture {
     let frame = scene.trace(camera, 2, seed as u64);
     Picture {
-        width: SIZE[0] as usize,
-        height: SIZE[1] as usize,
+        width: PHOTO_SIZE[0] as usize,
+        height: PHOTO_SIZE[1] as usize,
         rgb: frame.color.to_u8(),
     }
 }
@@ -362,7 +364,7 @@ fn twins(seed: u64) -> (SynthScene, Vec<Camera>) {
     let camera = |eye: Vec3, target: Vec3| {
         Camera::new(
             Pose::look_at(eye, target, Vec3::Z),
-            Intrinsics::from_fov_x(SIZE[0], SIZE[1], FOV),
+            Intrinsics::from_fov_x(PHOTO_SIZE[0], PHOTO_SIZE[1], FOV_RADIANS),
         )
     };
     let around = |center: Vec3| {
@@ -420,7 +422,7 @@ impl Picture {
     }
 
     /// The image blurred over 1.6 % of the longer side: along x, along the diagonal or in all directions, depending on `turn`.
-    fn smeared(&self, turn: usize) -> Self {
+    fn motion_blurred(&self, turn: usize) -> Self {
         let length = (0.016 * self.width.max(self.height) as f64).round().max(3.0) as usize;
         let steps: Vec<(usize, usize)> = match turn % 3 {
             0 => (0..length).map(|i| (i, 0)).collect(),
@@ -429,8 +431,8 @@ impl Picture {
                 .map(|i| (i % length * 7 / 10, i / length))
                 .collect(),
         };
-        let mut smeared = self.clone();
-        for (i, value) in smeared.rgb.iter_mut().enumerate() {
+        let mut motion_blurred = self.clone();
+        for (i, value) in motion_blurred.rgb.iter_mut().enumerate() {
             let (c, x, y) = (i % 3, i / 3 % self.width, i / 3 / self.width);
             let sum: u32 = steps
                 .iter()
@@ -438,11 +440,11 @@ impl Picture {
                 .sum();
             *value = (sum / steps.len() as u32) as u8;
         }
-        smeared
+        motion_blurred
     }
 
     /// Exposes the image with `stops` more light.
-    fn expose(&mut self, stops: f64) {
+    fn change_exposure(&mut self, stops: f64) {
         for value in &mut self.rgb {
             let light = (f64::from(*value) / 255.0).powf(2.2) * stops.exp2();
             *value = (255.0 * light.min(1.0).powf(1.0 / 2.2)).round() as u8;
@@ -468,7 +470,7 @@ impl Picture {
     }
 
     /// The lower left part of the image, with the fraction `keep` of each side.
-    fn cut(&self, keep: f64) -> Self {
+    fn cropped(&self, keep: f64) -> Self {
         let [width, height] = [self.width, self.height].map(|side| (keep * side as f64) as usize);
         let above = self.height - height;
         let row = |y: usize| &self.rgb[3 * (above + y) * self.width..][..3 * width];
@@ -479,7 +481,7 @@ impl Picture {
         }
     }
 
-    fn put_behind(&mut self, behind: &Self, background: &[bool]) {
+    fn replace_background(&mut self, behind: &Self, background: &[bool]) {
         for (i, is_background) in background.iter().enumerate() {
             if *is_background {
                 self.rgb[3 * i..][..3].copy_from_slice(&behind.rgb[3 * i..][..3]);
@@ -488,7 +490,7 @@ impl Picture {
     }
 
     /// Covers a random part of the image with a patterned board, the same in each call.
-    fn stand_in_the_way(&mut self, rng: &mut Rng) {
+    fn add_person(&mut self, rng: &mut Rng) {
         let side = self.width.min(self.height) / 3;
         let board = Self::noise(side, side, 77);
         let corner = Vec2::new(rng.uniform(), rng.uniform())

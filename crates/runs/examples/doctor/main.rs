@@ -36,8 +36,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         }
         let folder = out.join(&name);
         let (photos, expected) = capture.photographs(&folder.join("photos"))?;
-        for (mode, (which, findings)) in examined(&photos, &folder).into_iter().enumerate() {
-            println!("{name} ({which}): {}", in_words(&findings));
+        for (mode, (which, findings)) in examine(&photos, &folder).into_iter().enumerate() {
+            println!("{name} ({which}): {}", format_findings(&findings));
             if let Expected::Nothing { photographs } = &expected {
                 clean[mode].0 += photographs;
                 clean[mode].1 += findings.len();
@@ -74,7 +74,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
 const MODES: [&str; 2] = ["pairs", "model"];
 
 /// The findings from pairs alone, and with the model.
-fn examined(photos: &Path, folder: &Path) -> Vec<(&'static str, Vec<Finding>)> {
+fn examine(photos: &Path, folder: &Path) -> Vec<(&'static str, Vec<Finding>)> {
     // Both use the same features, which are extracted once.
     let quick = DoctorInput {
         out: Some(folder.join("posed")),
@@ -97,7 +97,7 @@ fn examined(photos: &Path, folder: &Path) -> Vec<(&'static str, Vec<Finding>)> {
     vec![(MODES[0], pairs), (MODES[1], model)]
 }
 
-fn in_words(findings: &[Finding]) -> String {
+fn format_findings(findings: &[Finding]) -> String {
     let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
     findings
         .iter()
@@ -148,7 +148,7 @@ fn score(expected: &Expected, capture: &Capture, findings: &[Finding], mut add: 
         }
     }
     // A finding about a whole capture is wrong wherever that fault was not planted.
-    const WHOLE: [(&str, &str); 6] = [
+    const CAPTURE_FINDINGS: [(&str, &str); 6] = [
         ("gap", "gap"),
         ("open-loop", "loop"),
         ("rotation-only", "rotation"),
@@ -156,7 +156,7 @@ fn score(expected: &Expected, capture: &Capture, findings: &[Finding], mut add: 
         ("moving", "moving"),
         ("contradiction", "twin"),
     ];
-    for (kind, injury) in WHOLE {
+    for (kind, injury) in CAPTURE_FINDINGS {
         let expects = matches!(expected, Expected::Capture { kinds } if kinds.contains(&kind));
         let found = findings.iter().any(|finding| finding.kind == kind);
         if found && !expects && !capture.tolerates(kind) {

@@ -5,12 +5,13 @@
 //! compensate for the rounding. SOG's palette and codebooks represent values that came from them exactly, so the final encoding loses next
 //! to nothing.
 
-mod between;
+mod interpolate;
 mod tries;
 
+use crate::evaluate::hold_out_readable;
 use crate::levels::write_scene;
-use crate::{Reading, RunError, RunFolder, Scene, check_kept, read_vignette, residual_left_out, scene_of};
-use between::with_views_between;
+use crate::{ReadingOptions, RunError, Scene, check_not_overwritten, read_vignette, residual_left_out, scene_path};
+use interpolate::with_interpolated_views;
 use irradia_formats::{SplatFormat, WriteOptions, splat_file_size};
 use irradia_train::model::Model;
 use std::path::PathBuf;
@@ -41,8 +42,8 @@ pub struct CompactInput {
     pub keep_psnr: Option<f64>,
     /// Training steps of a try.
     pub steps: u64,
-    /// How the dataset is read.
-    pub reading: Reading,
+    /// How the dataset is read, where that differs from the run that contains the scene.
+    pub reading: ReadingOptions,
     /// How the file is written; options that are `None` are chosen for the number of splats.
     pub write: WriteOptions,
     /// Random seed.
@@ -62,7 +63,7 @@ impl CompactInput {
             target: None,
             keep_psnr: Some(0.2),
             steps: Self::STEPS,
-            reading: Reading::default(),
+            reading: ReadingOptions::default(),
             write: WriteOptions::default(),
             seed: 0,
         }
@@ -132,15 +133,15 @@ pub enum CompactEvent {
     },
 }
 
-/// Compacts a scene and writes it; nothing is written before the end. `see` receives the progress.
+/// Compacts a scene and writes it; nothing is written before the end. `on_event` receives the progress.
 ///
 /// # Errors
 /// When a setting is out of range, scene or dataset cannot be read, the scene has no splats, the target cannot be reached, or the output
 /// cannot be written.
-pub fn compact(input: &CompactInput, see: &mut dyn FnMut(CompactEvent)) -> Result<Compacted, RunError> {
+pub fn compact(input: &CompactInput, on_event: &mut dyn FnMut(CompactEvent)) -> Result<Compacted, RunError> {
     let format = input.check()?;
-    let file = scene_of(&input.scene);
-    check_kept(&file, &input.out)?;
+    let file = scene_path(&input.scene);
+    check_not_overwritten(&file, &input.out)?;
     let mut scene = Scene::read(&file)?;
     if let Model::Splats { residual, .. } = &mut scene.model {
         // The output cannot hold it: what is lost is measured without it.
@@ -150,48 +151,42 @@ pub fn compact(input: &CompactInput, see: &mut dyn FnMut(CompactEvent)) -> Resul
         let message = format!("{} is a radiance field: only splats can be compacted", file.display());
         return Err(RunError::Refused(message));
     };
-    let mut reading = input.reading.clone();
-    if let Some(record) = RunFolder::around(&file) {
-        reading = reading.over(record.input.reading);
-    }
-    let mut dataset = reading.read(&input.data)?;
-    if let (None, Some(folder)) = (&input.reading.holdout, RunFolder::containing(&file)) {
-        folder.hold_out_again(&mut dataset)?;
-    }
+    let mut dataset = input.reading.read_for(&file, &input.data)?;
+    hold_out_readable(&mut dataset);
     let dataset = scene.place(dataset);
     let mut notes = dataset.warnings.clone();
     notes.extend(residual_left_out(&file, "splat formats cannot hold it"));
     let measure = Measure::new(&dataset, scene.options, read_vignette(&file)?);
-    let before = measure.of(&scene.model)?;
-    let held_out_before = measure.of_held_out(&scene.model)?;
+    let before = measure.train_psnr(&scene.model)?;
+    let held_out_before = measure.held_out_psnr(&scene.model)?;
     let count = splats.len();
-    let dataset = with_views_between(dataset, &scene, measure.vignette());
+    let dataset = with_interpolated_views(dataset, &scene, measure.vignette());
     let mut tries = Tries::new(input, format, &scene, splats, dataset, &measure)?;
     let found = match input.target {
         Some(target) => {
             let found = match target {
-                CompactTarget::Splats(most) => tries.with(most.min(count), see)?,
-                CompactTarget::Bytes(most) => tries.within(most, see)?,
+                CompactTarget::Splats(most) => tries.train(most.min(count), on_event)?,
+                CompactTarget::Bytes(most) => tries.fit_bytes(most, on_event)?,
             };
             match input.keep_psnr.map(|loss| before - loss) {
-                Some(least) if found.psnr < least => {
+                Some(min_psnr) if found.psnr < min_psnr => {
                     notes.push(format!(
                         "the target would lose {:.2} dB on the training views: more splats are kept",
                         before - found.psnr
                     ));
-                    tries.begin_again(&scene);
-                    tries.smallest(found.splats.len(), least, see)?
+                    tries.reset(&scene);
+                    tries.find_smallest(found.splats.len(), min_psnr, on_event)?
                 }
                 _ => found,
             }
         }
-        None => tries.smallest(1, before - input.keep_psnr.unwrap_or_default(), see)?,
+        None => tries.find_smallest(1, before - input.keep_psnr.unwrap_or_default(), on_event)?,
     };
     if let Some(loss) = input.keep_psnr.filter(|loss| found.psnr < before - loss) {
         notes.push(format!("every try lost more than {loss} dB: all splats are kept"));
     }
     let model = tries.model(&found.splats);
-    let held_out_after = measure.of_held_out(&model)?;
+    let held_out_after = measure.held_out_psnr(&model)?;
     notes.extend(write_scene(&input.out, &tries.cloud(&found.splats), &found.write)?);
     Ok(Compacted {
         formats: [SplatFormat::of(&file)?, format],

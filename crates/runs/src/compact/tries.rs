@@ -4,13 +4,13 @@ use super::{CompactEvent, CompactInput};
 use crate::convert::in_world;
 use crate::{Background, RunError, Scene, evaluate};
 use irradia_compute::Device;
-use irradia_formats::{SogDetail, SplatFormat, WriteOptions, through_format};
+use irradia_formats::{SogDetail, SplatFormat, WriteOptions, round_trip};
 use irradia_scene::{Camera, Dataset, GaussianCloud, Similarity};
 use irradia_splat::contribution::{Contributions, contributions};
 use irradia_splat::{SplatState, Splats};
 use irradia_train::eval::{EvalOptions, Metrics};
 use irradia_train::half_fit::HalfFit;
-use irradia_train::memory::usual_limit;
+use irradia_train::memory::default_limit;
 use irradia_train::model::{Model, RenderOptions};
 use irradia_train::recipe::Param;
 use irradia_train::socket::Vignette;
@@ -20,16 +20,16 @@ use std::sync::Arc;
 /// The recipe for training the splats further.
 const RECIPE: &str = include_str!("recipe.toml");
 /// Number of rounds in which splats are removed.
-const ROUNDS: u32 = 6;
+const REMOVAL_ROUNDS: u32 = 6;
 /// Maximum number of training views on which PSNR is measured.
-const MEASURED_VIEWS: usize = 32;
+const MAX_MEASURED_VIEWS: usize = 32;
 /// Maximum number of views from which contributions are computed.
-const JUDGING_VIEWS: usize = 160;
+const MAX_CONTRIBUTION_VIEWS: usize = 160;
 /// How finely the file represents a scene.
 #[derive(Clone, Copy)]
-struct Grain {
+struct Quality {
     /// Share of the splats that keep their harmonics: those where harmonics are most visible.
-    shown: f64,
+    harmonics_share: f64,
     /// Entries of the palette of harmonics per splat.
     palette: f64,
     /// Quantisation of SOG; its number of palette entries is replaced according to `palette`.
@@ -39,45 +39,45 @@ struct Grain {
 /// The fewest bytes per splat: quantisation that is invisible after training for it. With only half of the harmonics kept, fox_colmap
 /// loses 0.1 dB for 3 % of the bytes, more than removing splats would cost; on lund_door with 34,000 splats a palette of 0.1 takes 713 kB
 /// instead of 612 and gains 0.02 dB.
-const COARSE: Grain = Grain {
-    shown: 0.8,
+const COARSE_QUALITY: Quality = Quality {
+    harmonics_share: 0.8,
     palette: 0.03,
     detail: SogDetail {
         palette: 0,
         position_bits: 14,
         rotation_bits: 7,
-        numbers: 128,
+        codebook: 128,
     },
 };
 /// If all splats fit with bytes to spare, the finest of these that fits is used. At a target of a tenth of the bytes of fox_colmap and
-/// lund_door, [`COARSE`] (6.3 and 6.1 % of the bytes) loses 0.15 and 0.21 dB of held-out PSNR.
-const FINER: [Grain; 2] = [
-    Grain {
-        shown: 1.0,
+/// lund_door, [`COARSE_QUALITY`] (6.3 and 6.1 % of the bytes) loses 0.15 and 0.21 dB of held-out PSNR.
+const FINER_QUALITIES: [Quality; 2] = [
+    Quality {
+        harmonics_share: 1.0,
         palette: 0.1,
-        detail: FINEST,
+        detail: FINEST_DETAIL,
     },
-    Grain {
-        shown: 1.0,
+    Quality {
+        harmonics_share: 1.0,
         palette: 0.03,
-        detail: FINEST,
+        detail: FINEST_DETAIL,
     },
 ];
-const FINEST: SogDetail = SogDetail {
+const FINEST_DETAIL: SogDetail = SogDetail {
     palette: 0,
     position_bits: 16,
     rotation_bits: 8,
-    numbers: 256,
+    codebook: 256,
 };
 /// All splats fit with bytes to spare if they take at most this share of the target before their training.
-const SPARE: f64 = 0.97;
+const MAX_TARGET_SHARE: f64 = 0.97;
 /// Maximum number of tries to meet a target in bytes: if the first three miss it, harmonics or rounding cost more than the linear model of
 /// bytes by splats predicts.
-const MISSES: u32 = 6;
+const MAX_SIZE_TRIES: u32 = 6;
 /// Maximum number of tries in the search for the smallest scene.
-const SEARCHES: u32 = 6;
+const MAX_SEARCH_TRIES: u32 = 6;
 /// The search ends when its bounds differ by less than this factor.
-const CLOSE: f64 = 1.1;
+const SEARCH_TOLERANCE: f64 = 1.1;
 
 /// Measures the PSNR of splats against the photographs.
 pub(super) struct Measure {
@@ -102,19 +102,19 @@ impl Measure {
     }
 
     /// Mean PSNR over evenly spaced training views, dB.
-    pub fn of(&self, model: &Model) -> Result<f64, RunError> {
+    pub fn train_psnr(&self, model: &Model) -> Result<f64, RunError> {
         let train = &self.dataset.train;
-        let step = train.len().div_ceil(MEASURED_VIEWS).max(1);
-        self.psnr(model, &train.iter().copied().step_by(step).collect::<Vec<_>>())
+        let step = train.len().div_ceil(MAX_MEASURED_VIEWS).max(1);
+        self.mean_psnr(model, &train.iter().copied().step_by(step).collect::<Vec<_>>())
     }
 
     /// Mean PSNR over held-out views, dB; `None` if there are none.
-    pub fn of_held_out(&self, model: &Model) -> Result<Option<f64>, RunError> {
-        let psnr = self.psnr(model, &self.dataset.test)?;
+    pub fn held_out_psnr(&self, model: &Model) -> Result<Option<f64>, RunError> {
+        let psnr = self.mean_psnr(model, &self.dataset.test)?;
         Ok(Some(psnr).filter(|psnr| !psnr.is_nan()))
     }
 
-    fn psnr(&self, model: &Model, views: &[usize]) -> Result<f64, RunError> {
+    fn mean_psnr(&self, model: &Model, views: &[usize]) -> Result<f64, RunError> {
         let options = EvalOptions {
             render: self.options,
             metrics: Metrics::Psnr,
@@ -127,14 +127,14 @@ impl Measure {
 }
 
 /// A scene as decoded from its file.
-pub(super) struct Found {
+pub(super) struct DecodedScene {
     pub splats: Splats,
     pub bytes: u64,
     pub psnr: f64,
     pub write: WriteOptions,
 }
 
-impl Found {
+impl DecodedScene {
     /// Number of splats with harmonics above degree 0.
     pub fn with_harmonics(&self) -> usize {
         let sh = &self.splats.sh;
@@ -153,8 +153,8 @@ pub(super) struct Tries<'a> {
     options: RenderOptions,
     world_from_dataset: Similarity,
     /// The splats with which the next try begins: those of the smallest scene so far that was good enough.
-    begin: Splats,
-    grain: Grain,
+    initial: Splats,
+    quality: Quality,
 }
 
 impl<'a> Tries<'a> {
@@ -181,17 +181,17 @@ impl<'a> Tries<'a> {
             recipe,
             options: scene.options,
             world_from_dataset: scene.world_from_dataset,
-            begin: splats,
-            grain: COARSE,
+            initial: splats,
+            quality: COARSE_QUALITY,
         })
     }
 
     /// Makes the next try begin with all splats of `scene`, like the first one.
-    pub fn begin_again(&mut self, scene: &Scene) {
+    pub fn reset(&mut self, scene: &Scene) {
         if let Some(splats) = scene.model.splats() {
-            self.begin = splats.clone();
+            self.initial = splats.clone();
         }
-        self.grain = COARSE;
+        self.quality = COARSE_QUALITY;
     }
 
     /// `splats` for rendering.
@@ -211,8 +211,8 @@ impl<'a> Tries<'a> {
     /// The options for writing `count` splats.
     fn write_options(&self, count: usize) -> WriteOptions {
         let detail = SogDetail {
-            palette: ((count as f64 * self.grain.palette) as usize).clamp(64, 65_536),
-            ..self.grain.detail
+            palette: ((count as f64 * self.quality.palette) as usize).clamp(64, 65_536),
+            ..self.quality.detail
         };
         WriteOptions {
             sog: self.input.write.sog.or(Some(detail)),
@@ -221,69 +221,76 @@ impl<'a> Tries<'a> {
     }
 
     /// Encodes and decodes `splats`; returns the decoded splats and the size of the file in bytes.
-    fn through(&self, splats: &Splats) -> Result<(Splats, u64), RunError> {
+    fn round_trip(&self, splats: &Splats) -> Result<(Splats, u64), RunError> {
         let options = self.write_options(splats.len());
-        let (cloud, bytes) = through_format(self.format, &self.cloud(splats), &options)?;
+        let (cloud, bytes) = round_trip(self.format, &self.cloud(splats), &options)?;
         let cloud = in_world(cloud, &self.world_from_dataset);
         Ok((Splats::from_cloud(&cloud), bytes as u64))
     }
 
-    fn judge(&self, splats: &Splats, seed: u64) -> Contributions {
+    fn measure_contributions(&self, splats: &Splats, seed: u64) -> Contributions {
         let train = &self.dataset.train;
-        let step = train.len().div_ceil(JUDGING_VIEWS).max(1);
+        let step = train.len().div_ceil(MAX_CONTRIBUTION_VIEWS).max(1);
         let views = train.iter().step_by(step);
         let cameras: Vec<Camera> = views.map(|i| self.dataset.views[*i].camera).collect();
         contributions(splats, &cameras, &self.options, seed)
     }
 
     /// A scene of `count` splats, trained.
-    pub fn with(&self, count: usize, see: &mut dyn FnMut(CompactEvent)) -> Result<Found, RunError> {
+    pub fn train(&self, count: usize, on_event: &mut dyn FnMut(CompactEvent)) -> Result<DecodedScene, RunError> {
         let options = TrainOptions {
             seed: self.input.seed,
             steps: Some(self.input.steps),
-            memory: usual_limit(),
+            memory: default_limit(),
             ..TrainOptions::default()
         };
-        let first = self.begin.len();
-        let mut trainer = Trainer::from_splats(self.dataset.clone(), self.recipe.clone(), options, self.begin.clone())?;
+        let first = self.initial.len();
+        let mut trainer =
+            Trainer::from_splats(self.dataset.clone(), self.recipe.clone(), options, self.initial.clone())?;
         trainer.sockets.vignette.clone_from(&self.measure.vignette);
         let (mut rounds, mut stage, mut events) = (0, 0, Vec::new());
         while !trainer.finished() {
             let removed = trainer.clock.time / self.recipe.stage[0].steps as f64;
-            if rounds < ROUNDS && removed >= f64::from(rounds) / f64::from(ROUNDS) && count < first {
+            if rounds < REMOVAL_ROUNDS && removed >= f64::from(rounds) / f64::from(REMOVAL_ROUNDS) && count < first {
                 rounds += 1;
                 // The number decreases by the same factor in each round.
-                let share = (count as f64 / first as f64).powf(f64::from(rounds) / f64::from(ROUNDS));
-                let most = ((first as f64 * share).round() as usize).max(count);
+                let share = (count as f64 / first as f64).powf(f64::from(rounds) / f64::from(REMOVAL_ROUNDS));
+                let max_splats = ((first as f64 * share).round() as usize).max(count);
                 let change = self
-                    .judge(&trainer.engine.state().splats, self.input.seed + u64::from(rounds))
+                    .measure_contributions(&trainer.engine.state().splats, self.input.seed + u64::from(rounds))
                     .change;
-                keep(trainer.engine.state_mut(), &change, most);
+                keep_highest(trainer.engine.state_mut(), &change, max_splats);
             }
             if trainer.clock.stage > stage {
                 if stage == 0 {
-                    let weight = self.judge(&trainer.engine.state().splats, self.input.seed).weight;
-                    hide_harmonics(&mut trainer.engine.state_mut().splats, &weight, self.grain.shown);
+                    let weight = self
+                        .measure_contributions(&trainer.engine.state().splats, self.input.seed)
+                        .weight;
+                    drop_harmonics(
+                        &mut trainer.engine.state_mut().splats,
+                        &weight,
+                        self.quality.harmonics_share,
+                    );
                 }
                 stage = trainer.clock.stage;
-                let held = self.through(&trainer.engine.state().splats)?.0;
-                *trainer.engine.state_mut() = SplatState::new(held);
+                let decoded = self.round_trip(&trainer.engine.state().splats)?.0;
+                *trainer.engine.state_mut() = SplatState::new(decoded);
             }
             let report = trainer.step(&mut events)?;
             events.clear();
-            see(CompactEvent::Step {
+            on_event(CompactEvent::Step {
                 steps: [report.step, trainer.total_steps()],
                 splats: [trainer.engine.len(), count],
             });
         }
-        let (splats, bytes) = self.through(&trainer.engine.state().splats)?;
-        let found = Found {
+        let (splats, bytes) = self.round_trip(&trainer.engine.state().splats)?;
+        let found = DecodedScene {
             bytes,
-            psnr: self.measure.of(&self.model(&splats))?,
+            psnr: self.measure.train_psnr(&self.model(&splats))?,
             write: self.write_options(splats.len()),
             splats,
         };
-        see(CompactEvent::Tried {
+        on_event(CompactEvent::Tried {
             splats: found.splats.len(),
             bytes,
             psnr: found.psnr,
@@ -291,84 +298,88 @@ impl<'a> Tries<'a> {
         Ok(found)
     }
 
-    /// A scene of as many splats as fit into `most` bytes, trained.
+    /// A scene of as many splats as fit into `max_bytes` bytes, trained.
     ///
     /// # Errors
     /// When not even a few splats fit.
-    pub fn within(&mut self, most: u64, see: &mut dyn FnMut(CompactEvent)) -> Result<Found, RunError> {
-        let first = self.begin.len();
-        let mut order = SplatState::new(self.begin.clone());
-        let judged = self.judge(&order.splats, self.input.seed);
-        hide_harmonics(&mut order.splats, &judged.weight, self.grain.shown);
+    pub fn fit_bytes(
+        &mut self,
+        max_bytes: u64,
+        on_event: &mut dyn FnMut(CompactEvent),
+    ) -> Result<DecodedScene, RunError> {
+        let first = self.initial.len();
+        let mut order = SplatState::new(self.initial.clone());
+        let measured = self.measure_contributions(&order.splats, self.input.seed);
+        drop_harmonics(&mut order.splats, &measured.weight, self.quality.harmonics_share);
         // Bytes are nearly linear in the number of splats: a line through two points predicts the number at the limit.
         let bytes_with = |tries: &Self, count: usize| -> Result<f64, RunError> {
             let mut state = order.clone();
-            keep(&mut state, &judged.change, count);
-            Ok(tries.through(&state.splats)?.1 as f64)
+            keep_highest(&mut state, &measured.change, count);
+            Ok(tries.round_trip(&state.splats)?.1 as f64)
         };
         let half_count = (first / 2).max(1);
         let (all, half) = (bytes_with(self, first)?, bytes_with(self, half_count)?);
-        if all <= most as f64 {
-            for grain in FINER {
-                self.grain = grain;
-                if self.through(&self.begin)?.1 as f64 <= SPARE * most as f64 {
-                    let found = self.with(first, see)?;
-                    if found.bytes <= most {
+        if all <= max_bytes as f64 {
+            for quality in FINER_QUALITIES {
+                self.quality = quality;
+                if self.round_trip(&self.initial)?.1 as f64 <= MAX_TARGET_SHARE * max_bytes as f64 {
+                    let found = self.train(first, on_event)?;
+                    if found.bytes <= max_bytes {
                         return Ok(found);
                     }
                 }
             }
-            self.grain = COARSE;
+            self.quality = COARSE_QUALITY;
         }
         let slope = ((all - half) / (first - half_count).max(1) as f64).max(1.0);
         let mut count = first;
-        if all > most as f64 {
-            count = (first as f64 - (all - most as f64) / slope) as usize;
+        if all > max_bytes as f64 {
+            count = (first as f64 - (all - max_bytes as f64) / slope) as usize;
             let near = bytes_with(self, count.clamp(1, first))?;
-            count = (count as f64 + (most as f64 - near) / slope).max(0.0) as usize;
+            count = (count as f64 + (max_bytes as f64 - near) / slope).max(0.0) as usize;
         }
-        for miss in 0..MISSES {
+        for miss in 0..MAX_SIZE_TRIES {
             if count == 0 {
                 break;
             }
-            let found = self.with(count.min(first), see)?;
-            if found.bytes <= most {
+            let found = self.train(count.min(first), on_event)?;
+            if found.bytes <= max_bytes {
                 return Ok(found);
             }
             // The remaining splats are trained further, minus a few, and minus more after each miss; the part of a file that does not
             // depend on the number of splats stays.
-            let excess = 1.1 * f64::from(1 << miss) * (found.bytes - most) as f64 / slope;
+            let excess = 1.1 * f64::from(1 << miss) * (found.bytes - max_bytes) as f64 / slope;
             let had = found.splats.len() as f64;
             count = (had - excess.max(1.0)).max(0.5 * had) as usize;
-            self.begin = found.splats;
+            self.initial = found.splats;
         }
         Err(RunError::setting(
             "target",
-            format!("{most} bytes"),
+            format!("{max_bytes} bytes"),
             format!("the scene cannot be made this small as {}", self.format),
         ))
     }
 
-    /// The smallest scene of at least `fewest` splats with a PSNR of at least `least` dB, by bisection; one of all splats if no try reaches
-    /// that PSNR.
-    pub fn smallest(
+    /// The smallest scene of at least `min_splats` splats with a PSNR of at least `min_psnr` dB, by bisection; one of all splats if no try
+    /// reaches that PSNR.
+    pub fn find_smallest(
         &mut self,
-        fewest: usize,
-        least: f64,
-        see: &mut dyn FnMut(CompactEvent),
-    ) -> Result<Found, RunError> {
-        let all = self.begin.len();
-        let (mut low, mut high) = ((all / 100).max(fewest).max(1) as f64, all as f64);
-        let mut best: Option<Found> = None;
-        for _ in 0..SEARCHES {
+        min_splats: usize,
+        min_psnr: f64,
+        on_event: &mut dyn FnMut(CompactEvent),
+    ) -> Result<DecodedScene, RunError> {
+        let all = self.initial.len();
+        let (mut low, mut high) = ((all / 100).max(min_splats).max(1) as f64, all as f64);
+        let mut best: Option<DecodedScene> = None;
+        for _ in 0..MAX_SEARCH_TRIES {
             let count = (low * high).sqrt();
-            if high / low < CLOSE {
+            if high / low < SEARCH_TOLERANCE {
                 break;
             }
-            let found = self.with(count as usize, see)?;
-            if found.psnr >= least {
+            let found = self.train(count as usize, on_event)?;
+            if found.psnr >= min_psnr {
                 high = count;
-                self.begin.clone_from(&found.splats);
+                self.initial.clone_from(&found.splats);
                 best = Some(found);
             } else {
                 low = count;
@@ -376,13 +387,13 @@ impl<'a> Tries<'a> {
         }
         match best {
             Some(best) => Ok(best),
-            None => self.with(all, see),
+            None => self.train(all, on_event),
         }
     }
 }
 
 /// Keeps the `count` splats with the largest `score`.
-fn keep(state: &mut SplatState, score: &[f64], count: usize) {
+fn keep_highest(state: &mut SplatState, score: &[f64], count: usize) {
     let mut order: Vec<u32> = (0..state.len() as u32).collect();
     order.sort_by(|a, b| score[*b as usize].total_cmp(&score[*a as usize]).then(a.cmp(b)));
     order.truncate(count);
@@ -391,13 +402,13 @@ fn keep(state: &mut SplatState, score: &[f64], count: usize) {
 }
 
 /// Sets harmonics above degree 0 to zero, except for the `share` of the splats where they are most visible, by the light that they change.
-fn hide_harmonics(splats: &mut Splats, weight: &[f64], share: f64) {
+fn drop_harmonics(splats: &mut Splats, weight: &[f64], share: f64) {
     let planes = splats.sh.count();
     let energy = |i: usize| (3..planes).map(|c| f64::from(splats.sh.get(c, i)).powi(2)).sum::<f64>();
     let mut order: Vec<(f64, u32)> = (0..splats.len()).map(|i| (weight[i] * energy(i), i as u32)).collect();
     order.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
-    let shown = (share * order.len() as f64).ceil() as usize;
-    for (_, i) in &order[shown..] {
+    let kept = (share * order.len() as f64).ceil() as usize;
+    for (_, i) in &order[kept..] {
         (3..planes).for_each(|c| splats.sh.set(c, *i as usize, 0.0));
     }
 }
@@ -414,11 +425,11 @@ mod tests {
             splats.sh.set(5, i, 1.0 + i as f32);
         }
         let mut state = SplatState::new(splats);
-        keep(&mut state, &[3.0, 1.0, 4.0, 2.0], 3);
+        keep_highest(&mut state, &[3.0, 1.0, 4.0, 2.0], 3);
         let left: Vec<f32> = (0..3).map(|i| state.splats.means.get(0, i)).collect();
         assert_eq!(left, [0.0, 2.0, 3.0]);
-        hide_harmonics(&mut state.splats, &[100.0, 1.0, 1.0], 0.5);
-        let shown: Vec<f32> = (0..3).map(|i| state.splats.sh.get(5, i)).collect();
-        assert_eq!(shown, [1.0, 0.0, 4.0], "by weight times energy");
+        drop_harmonics(&mut state.splats, &[100.0, 1.0, 1.0], 0.5);
+        let harmonics: Vec<f32> = (0..3).map(|i| state.splats.sh.get(5, i)).collect();
+        assert_eq!(harmonics, [1.0, 0.0, 4.0], "by weight times energy");
     }
 }

@@ -3,11 +3,11 @@
 use super::capture::Capture;
 use super::known::KnownPoses;
 use super::stages::Work;
-use super::{AttemptReport, Clock, ENOUGH_POSED, PoseProgress};
+use super::{AttemptReport, MIN_POSED_FRACTION, PoseProgress, StageTimer};
 use crate::RunError;
 use irradia_sfm::PairMatches;
 use irradia_sfm::map::{
-    FEW_PHOTOS, MapOptions, PhotoInfo, Progress, Reconstruction, complete, extend, moving, reconstruct,
+    FEW_PHOTOS, MapOptions, PhotoInfo, Progress, Reconstruction, complete, extend, moving_matches, reconstruct,
 };
 use irradia_sfm::matching::PairOptions;
 use std::path::Path;
@@ -15,11 +15,11 @@ use std::path::Path;
 /// Number of following frames with which each frame of a film is always matched.
 const FILM_SUCCESSORS: usize = 10;
 /// Minimum number of contradicting pairs of neighbours for the model of few photographs to be suspected of being wrong.
-const CONTRADICTED: usize = 2;
+const MIN_CONTRADICTIONS: usize = 2;
 
 /// Maximum number of photographs that are matched along epipolar lines, equal to the maximum number of frames chosen from films. For 984
 /// frames of two films it took seven minutes and gave a model of 454 instead of 507, since what joins their parts was not filmed.
-const MOST_GUIDED: usize = 300;
+const MAX_GUIDED_PHOTOS: usize = 300;
 
 /// Photographs with features and matches.
 pub(super) struct Matched<'a> {
@@ -38,7 +38,7 @@ pub(super) struct Attempt<'a> {
 impl<'a> Matched<'a> {
     /// Finds features and matches of the photographs of `work`. If what stands still is `masked`, some still features remain at the edges
     /// of the masks: their matches are removed.
-    pub fn find(mut work: Work<'a>, capture: &Capture, masked: bool, clock: &mut Clock) -> Result<Self, RunError> {
+    pub fn find(mut work: Work<'a>, capture: &Capture, masked: bool, clock: &mut StageTimer) -> Result<Self, RunError> {
         work.find_features()?;
         clock.end("features");
         let pair_options = PairOptions {
@@ -49,7 +49,7 @@ impl<'a> Matched<'a> {
         clock.end("matches");
         let infos = capture.infos(work.photos());
         if masked {
-            pairs = moving(&infos, work.features(), &pairs);
+            pairs = moving_matches(&infos, work.features(), &pairs);
         }
         Ok(Self { work, infos, pairs })
     }
@@ -59,27 +59,27 @@ impl<'a> Matched<'a> {
         mut self,
         options: &MapOptions,
         known: Option<KnownPoses>,
-        clock: &mut Clock,
+        clock: &mut StageTimer,
         progress: &(dyn Fn(PoseProgress) + Sync),
     ) -> Result<Attempt<'a>, RunError> {
         let Self { work, infos, pairs } = &mut self;
         let of = work.photos().len();
         let begin = || progress(PoseProgress::Stage { name: "poses", of });
         begin();
-        let mut tell = |event| {
+        let mut on_progress = |event| {
             if let Progress::Registered { photos, .. } = event {
                 progress(PoseProgress::Done(photos));
             }
         };
         let is_new = known.is_none();
         let mut reconstruction = match known {
-            None => models(work, infos, pairs, options, &mut tell),
+            None => models(work, infos, pairs, options, &mut on_progress),
             Some(known) => {
-                let known = known.of(infos)?;
-                extend(infos, work.features(), pairs, &known, options, &mut tell)
+                let known = known.geometry_of(infos)?;
+                extend(infos, work.features(), pairs, &known, options, &mut on_progress)
             }
         };
-        let unmatched = reconstruction.absent_and_unmatched(pairs);
+        let unmatched = reconstruction.missing_and_unmatched(pairs);
         if is_new && !unmatched.is_empty() {
             // With many photographs, not all pairs are matched at first: if too many matches are absent, the remaining pairs are matched
             // as well.
@@ -87,7 +87,7 @@ impl<'a> Matched<'a> {
             all.sort_unstable();
             *pairs = work.matches_of(all)?;
             begin();
-            reconstruction = models(work, infos, pairs, options, &mut tell);
+            reconstruction = models(work, infos, pairs, options, &mut on_progress);
         }
         clock.end("poses");
         Ok(Attempt {
@@ -121,24 +121,24 @@ impl<'a> Attempt<'a> {
 
     /// Why a second attempt is made: too few photographs have a pose, or pairs of few photographs contradict the model. `None` if parts
     /// that look alike were mapped separately: a second attempt would only confuse them again.
-    pub fn falls_short(&self) -> Option<String> {
+    pub fn retry_reason(&self) -> Option<String> {
         let photos = self.matched.work.photos().len();
-        if self.reconstruction.apart.is_some() {
+        if self.reconstruction.split_models.is_some() {
             return None;
         }
-        if self.registered() < enough(photos) {
+        if self.registered() < min_registered(photos) {
             return Some(format!("{} of {photos} photographs have a pose", self.registered()));
         }
         let pairs = self.contradictions();
-        (pairs >= CONTRADICTED).then(|| format!("{pairs} pairs of photographs contradict the others"))
+        (pairs >= MIN_CONTRADICTIONS).then(|| format!("{pairs} pairs of photographs contradict the others"))
     }
 
     /// The same photographs for a second attempt, with frontal descriptors and matching along epipolar lines.
-    pub fn again(&self, wanted: Option<usize>, out: &Path) -> Work<'a> {
+    pub fn retry(&self, wanted: Option<usize>, out: &Path) -> Work<'a> {
         let photos = self.matched.work.photos().len();
         let posed = self.reconstruction.models.first().map(|model| &model.poses);
         let left_out = (0..photos).filter(|i| posed.is_none_or(|poses| poses[*i].is_none()));
-        self.matched.work.again(wanted, &left_out.collect::<Vec<_>>(), out)
+        self.matched.work.retry(wanted, &left_out.collect::<Vec<_>>(), out)
     }
 
     /// Whether this second attempt replaces the `first`. Its weak matches can give wrong models of few photographs (3 of 20 of a room
@@ -149,22 +149,22 @@ impl<'a> Attempt<'a> {
             return true;
         }
         let contradicted = first.contradictions();
-        contradicted >= CONTRADICTED
+        contradicted >= MIN_CONTRADICTIONS
             && 2 * self.contradictions() <= contradicted
             && self.registered() >= first.registered()
     }
 }
 
 /// Whether this many photographs are matched along epipolar lines in a second attempt.
-pub(super) fn may_be_guided(photos: usize) -> bool {
-    photos <= MOST_GUIDED
+pub(super) fn can_be_guided(photos: usize) -> bool {
+    photos <= MAX_GUIDED_PHOTOS
 }
 
 /// How many of this many photographs should have a pose.
-fn enough(photos: usize) -> usize {
+fn min_registered(photos: usize) -> usize {
     match photos {
         ..=FEW_PHOTOS => photos,
-        _ => (ENOUGH_POSED * photos as f64).ceil() as usize,
+        _ => (MIN_POSED_FRACTION * photos as f64).ceil() as usize,
     }
 }
 
@@ -177,22 +177,26 @@ fn models(
     infos: &[PhotoInfo],
     pairs: &[PairMatches],
     options: &MapOptions,
-    tell: &mut dyn FnMut(Progress),
+    on_progress: &mut dyn FnMut(Progress),
 ) -> Reconstruction {
     let is_second = work.sift().frontal;
-    let usual = MapOptions {
+    let unguided = MapOptions {
         narrow: options.narrow && !is_second,
         ..*options
     };
-    let found = reconstruct(infos, work.features(), pairs, &usual, tell);
-    if !is_second || found.registered() >= enough(infos.len()) || !may_be_guided(infos.len()) {
+    let found = reconstruct(infos, work.features(), pairs, &unguided, on_progress);
+    if !is_second || found.registered() >= min_registered(infos.len()) || !can_be_guided(infos.len()) {
         return found;
     }
-    let guided = MapOptions { guided: true, ..usual };
-    let holds = infos.len() > FEW_PHOTOS && 2 * found.registered() >= infos.len() && found.apart.is_none();
-    let again = match holds {
-        true => complete(infos, work.features(), pairs, &found, &guided, tell),
-        false => reconstruct(infos, work.features(), pairs, &guided, tell),
+    let guided = MapOptions {
+        guided: true,
+        ..unguided
+    };
+    let is_mostly_mapped =
+        infos.len() > FEW_PHOTOS && 2 * found.registered() >= infos.len() && found.split_models.is_none();
+    let again = match is_mostly_mapped {
+        true => complete(infos, work.features(), pairs, &found, &guided, on_progress),
+        false => reconstruct(infos, work.features(), pairs, &guided, on_progress),
     };
     if again.registered() > found.registered() {
         again

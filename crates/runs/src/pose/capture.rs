@@ -1,6 +1,6 @@
 //! The photographs to pose: those of one or several folders, frames of films, faces of panoramas.
 
-use super::brought::bring_panorama;
+use super::import::import_panorama;
 use super::{MIN_PHOTOS, PoseProgress, film, is_film};
 use crate::RunError;
 use crate::scene_file::same_file;
@@ -10,19 +10,19 @@ use irradia_formats::{
     read_photo_folders, write_atomic,
 };
 use irradia_sfm::geometry::camera::DCamera;
-use irradia_sfm::map::{Mount, PhotoInfo};
+use irradia_sfm::map::{PhotoInfo, RigMount};
 use rayon::prelude::*;
 use std::collections::{HashMap, HashSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Subfolders of the dataset's folder for frames of films and faces of panoramas.
-const FRAMES: &str = "frames";
-const FACES: &str = "faces";
+const FRAMES_FOLDER: &str = "frames";
+const FACES_FOLDER: &str = "faces";
 /// File that marks the folder of faces as written by an earlier call.
 const FACES_RECORD: &str = "faces.json";
 /// Depth of subfolders that are searched.
-const DEPTH: usize = 2;
+const MAX_FOLDER_DEPTH: usize = 2;
 
 /// Folders of photographs, and films.
 #[derive(Debug, Default, PartialEq)]
@@ -31,11 +31,11 @@ struct Sources {
     /// Films that the user named.
     films: Vec<PathBuf>,
     /// Films found in folders, except `live` ones.
-    beside: Vec<PathBuf>,
+    found_films: Vec<PathBuf>,
     /// Films that a phone took along with a photograph of the same name.
     live: Vec<PathBuf>,
     /// Subfolders with photographs in folders of photographs.
-    below: Vec<PathBuf>,
+    subfolders: Vec<PathBuf>,
 }
 
 impl Sources {
@@ -64,7 +64,7 @@ impl Sources {
         let is_live = |film: &PathBuf| photos.len() >= MIN_PHOTOS && stems.contains(&film.with_extension(""));
         let (live, films): (Vec<_>, Vec<_>) = films.cloned().partition(is_live);
         self.live.extend(live);
-        self.beside.extend(films);
+        self.found_films.extend(films);
         let is_beside = |entry: &Path| {
             let name = entry.file_name().unwrap_or_default().to_string_lossy();
             ["masks", "depths", "depth", "normals", "normal"].contains(&&*name) || name.starts_with("masks_")
@@ -77,7 +77,7 @@ impl Sources {
             if photos[0].parent() == Some(path) {
                 let is_capture =
                     |entry: &PathBuf| DatasetFormat::recognise(entry).is_none() && !photo_files(entry).is_empty();
-                self.below.extend(entries.into_iter().filter(is_capture));
+                self.subfolders.extend(entries.into_iter().filter(is_capture));
             }
         } else if depth > 0 {
             // A folder of datasets is not a capture.
@@ -94,14 +94,14 @@ impl Sources {
 /// Whether there is anything to pose at `path`: `path` is a film, or contains photographs or films, up to two levels of subfolders deep.
 pub fn is_capture(path: &Path) -> bool {
     let mut sources = Sources::default();
-    sources.add(path, None, DEPTH).is_ok() && sources != Sources::default()
+    sources.add(path, None, MAX_FOLDER_DEPTH).is_ok() && sources != Sources::default()
 }
 
 /// Creates a folder with an empty record, or empties it if its record shows that an earlier call wrote it.
 ///
 /// # Errors
 /// When the folder contains files without a record, or cannot be written.
-pub(super) fn begin(folder: &Path, record: &str) -> Result<(), RunError> {
+pub(super) fn prepare_folder(folder: &Path, record: &str) -> Result<(), RunError> {
     let record = folder.join(record);
     if folder.exists() {
         let is_empty = fs::read_dir(folder).is_ok_and(|mut entries| entries.next().is_none());
@@ -143,24 +143,24 @@ impl Capture {
     ) -> Result<Self, RunError> {
         let mut sources = Sources::default();
         for path in paths {
-            sources.add(path, out, DEPTH)?;
+            sources.add(path, out, MAX_FOLDER_DEPTH)?;
         }
         let mut repeated: Vec<(String, String)> = Vec::new();
         let mut unused = |paths: Vec<PathBuf>, why: &str| {
             let name = |path: PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
             repeated.extend(paths.into_iter().map(|path| (name(path), why.to_owned())));
         };
-        sources.below.retain(|folder| !sources.folders.contains(folder));
+        sources.subfolders.retain(|folder| !sources.folders.contains(folder));
         unused(
-            sources.below,
+            sources.subfolders,
             "a folder beside photographs: name it as well if its photographs are of the same scene",
         );
         unused(sources.live, "a film taken with the photograph of the same name");
         let named = sources.films.len();
-        match sources.beside.is_empty() || sources.folders.is_empty() || film::can_be_read() {
-            true => sources.films.append(&mut sources.beside),
+        match sources.found_films.is_empty() || sources.folders.is_empty() || film::is_ffmpeg_installed() {
+            true => sources.films.append(&mut sources.found_films),
             false => unused(
-                sources.beside,
+                sources.found_films,
                 "a film, which cannot be read without ffmpeg: install ffmpeg to use its frames",
             ),
         }
@@ -170,8 +170,8 @@ impl Capture {
         };
         let mut damaged = Vec::new();
         if !sources.films.is_empty() {
-            let folder = out.ok_or_else(|| needs_out("frames of a film"))?.join(FRAMES);
-            damaged = film::frames(&sources.films, named, &folder, progress)?;
+            let folder = out.ok_or_else(|| needs_out("frames of a film"))?.join(FRAMES_FOLDER);
+            damaged = film::write_frames(&sources.films, named, &folder, progress)?;
             sources.folders.push(folder);
         }
         let mut capture = Self {
@@ -204,9 +204,9 @@ impl Capture {
     /// Removes panoramas from the photographs.
     fn take_panoramas(&mut self) -> Vec<PhotoEntry> {
         let photos = std::mem::take(&mut self.folder.photos);
-        let are = find_panoramas(&photos);
+        let is_panorama = find_panoramas(&photos);
         let mut panoramas = Vec::new();
-        for (photo, is) in photos.into_iter().zip(are) {
+        for (photo, is) in photos.into_iter().zip(is_panorama) {
             match is {
                 true => panoramas.push(photo),
                 false => self.folder.photos.push(photo),
@@ -216,24 +216,24 @@ impl Capture {
     }
 
     fn add_faces(&mut self, panoramas: &[PhotoEntry], out: &Path) -> Result<(), RunError> {
-        let folder = &out.join(FACES);
-        begin(folder, FACES_RECORD)?;
-        let cut: Vec<Vec<PanoramaFace>> = panoramas
+        let folder = &out.join(FACES_FOLDER);
+        prepare_folder(folder, FACES_RECORD)?;
+        let faces_of_panoramas: Vec<Vec<PanoramaFace>> = panoramas
             .par_iter()
             .map(|panorama| panorama.cut_panorama(folder))
             .collect::<Result<_, _>>()?;
         for panorama in panoramas {
-            bring_panorama(out, panorama)?;
+            import_panorama(out, panorama)?;
         }
-        let all = || cut.iter().flatten().map(|face| &face.name);
-        let taken = |name: &&String| self.folder.photos.iter().any(|photo| photo.name == **name);
+        let all = || faces_of_panoramas.iter().flatten().map(|face| &face.name);
+        let is_taken = |name: &&String| self.folder.photos.iter().any(|photo| photo.name == **name);
         let mut names = HashSet::new();
-        if let Some(name) = all().find(|name| taken(name) || !names.insert(*name)) {
+        if let Some(name) = all().find(|name| is_taken(name) || !names.insert(*name)) {
             return Err(RunError::Refused(format!(
                 "a face of a panorama is named {name}, like another photograph: rename the panorama"
             )));
         }
-        let of: HashMap<String, (usize, PanoramaFace)> = (cut.into_iter().enumerate())
+        let of: HashMap<String, (usize, PanoramaFace)> = (faces_of_panoramas.into_iter().enumerate())
             .flat_map(|(rig, faces)| faces.into_iter().map(move |face| (face.name.clone(), (rig, face))))
             .collect();
         let written = read_photo_folder(folder)?;
@@ -243,7 +243,7 @@ impl Capture {
             let (rig, face) = &of[&photo.name];
             let tags = &panoramas[*rig].tags;
             // Only one face has the panorama's GPS position, so that it counts once.
-            photo.tags.gps = tags.gps.filter(|_| face.turn == DQuat::IDENTITY);
+            photo.tags.gps = tags.gps.filter(|_| face.rotation == DQuat::IDENTITY);
             photo.tags.time.clone_from(&tags.time);
             photo.tags.focal = Some(f64::from(face.camera.fx) / f64::from(photo.width.max(photo.height)));
             self.folder.photos.push(photo);
@@ -272,11 +272,11 @@ impl Capture {
                 height: photo.height,
                 group,
                 focal_prior_px: photo.focal_px(),
-                up: face.map_or(photo.up, |(_, face)| Some(face.turn.inverse() * DVec3::NEG_Y)),
+                up: face.map_or(photo.up, |(_, face)| Some(face.rotation.inverse() * DVec3::NEG_Y)),
                 camera: face.map(|(_, face)| DCamera::pinhole(&face.camera)),
-                mount: face.map(|(rig, face)| Mount {
+                mount: face.map(|(rig, face)| RigMount {
                     rig: *rig,
-                    rotation: face.turn,
+                    rotation: face.rotation,
                 }),
             }
         };
@@ -293,15 +293,15 @@ mod tests {
     fn folders_of_others_are_not_emptied() {
         let root = tempfile::tempdir().unwrap();
         let folder = root.path().join("frames");
-        begin(&folder, "record.json").unwrap();
+        prepare_folder(&folder, "record.json").unwrap();
         fs::write(folder.join("old.jpg"), "written by an earlier call").unwrap();
-        begin(&folder, "record.json").unwrap();
+        prepare_folder(&folder, "record.json").unwrap();
         assert!(!folder.join("old.jpg").exists());
         fs::remove_file(folder.join("record.json")).unwrap();
-        begin(&folder, "record.json").unwrap();
+        prepare_folder(&folder, "record.json").unwrap();
         fs::remove_file(folder.join("record.json")).unwrap();
         fs::write(folder.join("mine.jpg"), "somebody's").unwrap();
-        let error = begin(&folder, "record.json").unwrap_err().to_string();
+        let error = prepare_folder(&folder, "record.json").unwrap_err().to_string();
         assert!(error.contains("another source"), "{error}");
         assert!(folder.join("mine.jpg").exists());
     }
@@ -316,13 +316,13 @@ mod tests {
         };
         let live = |expected: &[&str]| {
             let mut sources = Sources::default();
-            sources.add(root.path(), None, DEPTH).unwrap();
-            let [live, beside] = [sources.live, sources.beside];
+            sources.add(root.path(), None, MAX_FOLDER_DEPTH).unwrap();
+            let [live, found_films] = [sources.live, sources.found_films];
             assert_eq!(
                 live,
                 expected.iter().map(|name| root.path().join(name)).collect::<Vec<_>>()
             );
-            assert_eq!(live.len() + beside.len(), 2);
+            assert_eq!(live.len() + found_films.len(), 2);
         };
         write(&["IMG_1.MOV", "walk.mp4", "walk.jpg"]);
         // A single photograph with the name of a film does not make the film a phone's.
@@ -346,12 +346,12 @@ mod tests {
         fs::write(root.path().join("days/walk.mp4"), "a film by its name").unwrap();
         let mut sources = Sources::default();
         let days = root.path().join("days");
-        sources.add(&days, None, DEPTH).unwrap();
+        sources.add(&days, None, MAX_FOLDER_DEPTH).unwrap();
         assert_eq!(
             sources.folders,
             ["monday", "tuesday/morning"].map(|name| days.join(name))
         );
-        assert_eq!(sources.beside, [days.join("walk.mp4")]);
+        assert_eq!(sources.found_films, [days.join("walk.mp4")]);
         assert!(sources.films.is_empty() && sources.live.is_empty());
         assert!(is_capture(&days) && is_capture(&days.join("walk.mp4")));
         // One of several folders has poses: the others do not form one capture with it.
@@ -362,7 +362,7 @@ mod tests {
         assert!(!is_capture(&sets));
         // Unless it is the output of an earlier call.
         let mut sources = Sources::default();
-        sources.add(&sets, Some(&sets.join("posed")), DEPTH).unwrap();
+        sources.add(&sets, Some(&sets.join("posed")), MAX_FOLDER_DEPTH).unwrap();
         assert_eq!(sources.folders, [sets.join("other")]);
     }
 
@@ -377,8 +377,8 @@ mod tests {
         // Where metadata are searched for the projection.
         bytes.extend(b"equirectangular");
         fs::write(&panorama, bytes).unwrap();
-        begin(&out.join(FACES), FACES_RECORD).unwrap();
-        let face = out.join(FACES).join("0_front.jpg");
+        prepare_folder(&out.join(FACES_FOLDER), FACES_RECORD).unwrap();
+        let face = out.join(FACES_FOLDER).join("0_front.jpg");
         fs::write(&face, "written by an earlier call").unwrap();
         let error = Capture::read(&[photos], Some(&out), true, &|_| ())
             .unwrap_err()

@@ -4,13 +4,13 @@
 //! own reprojection errors do not show it, since they dropped the contradicting matches; matching the photographs again does. If no other
 //! matches exist, nothing contradicts the poses: then the evidence is that photographs from nearly the same place share no points.
 
-use super::look::{Look, pose};
+use super::view_features::{ViewFeatures, pose};
 use irradia_scene::{Dataset, View};
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::geometry::pose::DPose;
 use irradia_sfm::map::{
-    ABSENT_PAIRS, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, VerifiedPair, absent, agreement, contradictions,
-    strengths, telling, verify,
+    MIN_MISSING_PAIRS, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, VerifiedPair, agreement, contradictions,
+    evidence_pairs, missing_matches, strengths, verify,
 };
 use irradia_sfm::matching::{MatchOptions, PairOptions, candidate_pairs, match_pairs};
 use rayon::prelude::*;
@@ -18,17 +18,17 @@ use std::collections::BTreeSet;
 
 /// Longer side of the compared photographs, px, and maximum number of features of each: recognising neighbours takes a fraction of what
 /// poses need.
-const SIDE: u32 = 480;
-const FEATURES: usize = 1000;
+const MAX_SIDE: u32 = 480;
+const MAX_FEATURES: usize = 1000;
 /// Maximum number of photographs that are compared; if there are more, evenly spaced ones.
-const PHOTOGRAPHS: usize = 120;
+const MAX_PHOTOS: usize = 120;
 
 /// Minimum number of pairs at which the poses must jump: a single one may be of parts of the scene that really look alike.
-const JUMPS: usize = 2;
+const MIN_JUMPS: usize = 2;
 /// Minimum number of neighbours that must agree with a photograph's pose for it to count as in place.
-const SEVERAL: usize = 2;
+const MIN_AGREEING: usize = 2;
 /// Minimum share of contradicting pairs for the error to be more than single wrong photographs.
-const SHARE: f64 = 0.1;
+const MIN_CONTRADICTING_SHARE: f64 = 0.1;
 
 /// How well matches between photographs agree with their poses.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -47,7 +47,8 @@ pub struct PoseCheck {
 impl PoseCheck {
     /// Whether the poses are wrong in more than single photographs.
     pub fn is_broken(&self) -> bool {
-        self.jumps.len() >= JUMPS || (self.contradicting.len() >= JUMPS && self.share() >= SHARE)
+        self.jumps.len() >= MIN_JUMPS
+            || (self.contradicting.len() >= MIN_JUMPS && self.share() >= MIN_CONTRADICTING_SHARE)
     }
 
     /// The share of pairs whose matches contradict their poses.
@@ -58,9 +59,9 @@ impl PoseCheck {
 
 /// Matches the photographs of `dataset` and compares the matches with its poses. Photographs that cannot be read are skipped.
 pub fn check_poses(dataset: &Dataset) -> PoseCheck {
-    let step = dataset.views.len().div_ceil(PHOTOGRAPHS).max(1);
-    let look = |view| Some((view, Look::at(view, SIDE, FEATURES)?));
-    let seen: Vec<(&View, Look)> = dataset.views.par_iter().step_by(step).filter_map(look).collect();
+    let step = dataset.views.len().div_ceil(MAX_PHOTOS).max(1);
+    let look = |view| Some((view, ViewFeatures::extract(view, MAX_SIDE, MAX_FEATURES)?));
+    let seen: Vec<(&View, ViewFeatures)> = dataset.views.par_iter().step_by(step).filter_map(look).collect();
     let (mut views, mut photos, mut features) = (Vec::new(), Vec::new(), Vec::new());
     for (group, (view, look)) in seen.into_iter().enumerate() {
         views.push(view);
@@ -86,18 +87,18 @@ pub fn check_poses(dataset: &Dataset) -> PoseCheck {
         ..Model::default()
     };
     let agreement = agreement(&photos, &features, &pairs, &model);
-    let in_place = in_place(photos.len(), &pairs, &strengths, &agreement);
+    let supported = find_supported(photos.len(), &pairs, &strengths, &agreement);
     let names = |pair: [u32; 2]| pair.map(|photo| photos[photo as usize].name.clone());
     let contradicting: Vec<[u32; 2]> = contradictions(&pairs, &strengths, &agreement)
         .into_iter()
         .map(|i| pairs[i].photos)
         .collect();
-    let jump = |photos: &&[u32; 2]| photos.iter().all(|photo| in_place[*photo as usize]);
+    let jump = |photos: &&[u32; 2]| photos.iter().all(|photo| supported[*photo as usize]);
     PoseCheck {
-        pairs: telling(&pairs, &strengths).count(),
+        pairs: evidence_pairs(&pairs, &strengths).count(),
         jumps: contradicting.iter().filter(jump).copied().map(names).collect(),
         contradicting: contradicting.into_iter().map(names).collect(),
-        absent: match absent.len() >= ABSENT_PAIRS {
+        absent: match absent.len() >= MIN_MISSING_PAIRS {
             true => absent.into_iter().map(names).collect(),
             false => Vec::new(),
         },
@@ -136,18 +137,18 @@ fn absent_pairs(dataset: &Dataset, views: &[&View], photos: &[PhotoInfo]) -> Vec
             .collect(),
         ..Model::default()
     };
-    absent(photos, &model).iter().map(|pair| pair.photos).collect()
+    missing_matches(photos, &model).iter().map(|pair| pair.photos).collect()
 }
 
 /// `[photos]` whether several neighbours of a photograph agree with its pose: a single wrong photograph contradicts all its neighbours,
 /// whereas at a jump the photographs on each side agree with one another.
-fn in_place(photos: usize, pairs: &[VerifiedPair], strengths: &[f64], agreement: &[Option<f64>]) -> Vec<bool> {
+fn find_supported(photos: usize, pairs: &[VerifiedPair], strengths: &[f64], agreement: &[Option<f64>]) -> Vec<bool> {
     let mut agreeing = vec![0; photos];
-    let agree = telling(pairs, strengths).filter(|i| agreement[*i].is_some_and(|agreement| agreement > 0.5));
+    let agree = evidence_pairs(pairs, strengths).filter(|i| agreement[*i].is_some_and(|agreement| agreement > 0.5));
     for photo in agree.flat_map(|i| pairs[i].photos) {
         agreeing[photo as usize] += 1;
     }
-    agreeing.into_iter().map(|agreeing| agreeing >= SEVERAL).collect()
+    agreeing.into_iter().map(|agreeing| agreeing >= MIN_AGREEING).collect()
 }
 
 /// The poses, moved and scaled such that the cameras' mean position is the origin and their median distance from it is 1.

@@ -1,17 +1,22 @@
 //! Poses by COLMAP, if requested: works with any installed version, whose options are taken from its own help.
 
-use super::brought;
-use super::capture::Capture;
+use super::capture::{Capture, prepare_folder};
+use super::import;
 use super::stages::max_features;
-use super::{LeftOutPhoto, PoseInput, PoseProgress, PoseReport, joined, output};
+use super::{LeftOutPhoto, PoseInput, PoseProgress, PoseReport, join_paths, output};
 use crate::RunError;
-use irradia_formats::{PhotoFolder, read_colmap_poses};
+use irradia_formats::{PhotoEntry, PhotoFolder, read_colmap_poses};
+use rayon::prelude::*;
 use std::fs;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
 /// Maximum number of photographs of which COLMAP matches all pairs; with more, it matches successive ones.
-const EXHAUSTIVE: usize = 300;
+const MAX_EXHAUSTIVE_PHOTOS: usize = 300;
+/// Folder in the dataset's folder for the masks as COLMAP reads them, removed when it has found the features.
+const COLMAP_MASKS_FOLDER: &str = "masks_colmap";
+/// File that marks it as written by an earlier call.
+const MASKS_RECORD_FILE: &str = "masks.json";
 
 /// Runs COLMAP's feature extraction, matching and mapper on the photographs of `capture`, and puts its models into `sparse` of the dataset.
 pub(super) fn run(
@@ -22,12 +27,12 @@ pub(super) fn run(
     let folder = &capture.folder;
     let colmap = Colmap::find(&input.colmap)?;
     let out = &input.out;
-    let images = out.join(brought::IMAGES);
+    let images = out.join(import::IMAGES_FOLDER);
     for photo in &folder.photos {
-        brought::bring_photo(out, photo)?;
+        import::import_photo(out, photo)?;
     }
-    // Also puts away files of other photographs: COLMAP reads everything in the folder.
-    brought::record(out, &folder.photos.iter().collect::<Vec<_>>(), false)?;
+    // Also moves files of other photographs to `unused`: COLMAP reads everything in the folder.
+    import::record(out, &folder.photos.iter().collect::<Vec<_>>(), false)?;
     let (database, written) = (out.join("colmap.db"), output::begin_models(out)?);
     if database.exists() {
         // COLMAP would add to the database of an earlier call.
@@ -49,14 +54,23 @@ pub(super) fn run(
         &["SiftExtraction.max_num_features", "FeatureExtraction.max_num_features"],
         &features,
     );
-    if folder.photos.iter().any(|photo| photo.mask.is_some()) {
-        let masks = out.join("masks");
+    let masks = out.join(COLMAP_MASKS_FOLDER);
+    let has_masks = folder.photos.iter().any(|photo| photo.mask.is_some());
+    if has_masks {
+        // COLMAP reads NAME.png only, and ignores only pixels of the value 0.
+        prepare_folder(&masks, MASKS_RECORD_FILE)?;
+        let write = |photo: &PhotoEntry| photo.write_mask(&masks.join(format!("{}.png", photo.name)));
+        folder.photos.par_iter().try_for_each(write)?;
         extract.option(&["ImageReader.mask_path"], &masks.to_string_lossy());
     }
-    extract.run()?;
+    let extracted = extract.run();
+    if has_masks {
+        fs::remove_dir_all(&masks).map_err(RunError::io("clear", &masks))?;
+    }
+    extracted?;
 
     stage("matches");
-    let in_order = capture.has_films || folder.photos.len() > EXHAUSTIVE;
+    let in_order = capture.has_films || folder.photos.len() > MAX_EXHAUSTIVE_PHOTOS;
     let mut matching = colmap.command(if in_order {
         "sequential_matcher"
     } else {
@@ -75,7 +89,7 @@ pub(super) fn run(
         let why = mapped.err().map_or(String::new(), |error| format!(" ({error})"));
         return Err(RunError::Refused(format!(
             "{}: COLMAP found no model{why}; try without --poses colmap, or see irradia doctor",
-            joined(&input.photos)
+            join_paths(&input.photos)
         )));
     }
     mapped?;
@@ -139,7 +153,7 @@ impl Colmap {
     }
 
     /// One of COLMAP's commands, with the options that its help lists.
-    fn command(&self, name: &'static str) -> Result<Step, RunError> {
+    fn command(&self, name: &'static str) -> Result<ColmapCommand, RunError> {
         let help = Command::new(&self.program)
             .args([name, "-h"])
             .stdin(Stdio::null())
@@ -150,9 +164,9 @@ impl Colmap {
         command.arg(name).stdin(Stdio::null());
         // No version opens a window for these commands, but Qt requires a display otherwise.
         command.env("QT_QPA_PLATFORM", "offscreen");
-        Ok(Step {
+        Ok(ColmapCommand {
             name,
-            known: format!(
+            help: format!(
                 "{}{}",
                 String::from_utf8_lossy(&help.stdout),
                 String::from_utf8_lossy(&help.stderr)
@@ -163,14 +177,14 @@ impl Colmap {
 }
 
 /// One of COLMAP's commands with its options.
-struct Step {
+struct ColmapCommand {
     name: &'static str,
     /// The command's help text.
-    known: String,
+    help: String,
     command: Command,
 }
 
-impl Step {
+impl ColmapCommand {
     fn path(&mut self, option: &str, path: &Path) -> &mut Self {
         self.command.arg(format!("--{option}")).arg(path);
         self
@@ -179,7 +193,7 @@ impl Step {
     /// Sets an option whose name differs between versions: the first of `names` that this version knows, if any.
     fn option(&mut self, names: &[&str], value: &str) {
         let is_known = |name: &&&str| {
-            self.known
+            self.help
                 .split_whitespace()
                 .any(|word| word.strip_prefix("--") == Some(**name))
         };
@@ -197,8 +211,8 @@ impl Step {
         if output.status.success() {
             return Ok(());
         }
-        let said = String::from_utf8_lossy(&output.stderr);
-        let last = said
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        let last = stderr
             .lines()
             .rev()
             .find(|line| !line.trim().is_empty())

@@ -1,14 +1,14 @@
 //! The capture doctor on files: `doctor.json`, and `doctor.html` with thumbnails and a plan.
 
 use super::capture::Capture;
-use super::stages::{Work, in_rgb};
-use super::{PoseProgress, by_reason, check_enough};
+use super::stages::{Work, to_rgb};
+use super::{PoseProgress, check_photo_count, group_by_reason};
 use crate::RunError;
 use crate::folder::to_json;
 use irradia_formats::{PhotoFolder, write_atomic, write_png};
 use irradia_sfm::PairMatches;
 use irradia_sfm::doctor::{Diagnosis, Evidence, diagnose, shots};
-use irradia_sfm::map::{MapOptions, Model, PhotoInfo, Reconstruction, StandsStill, verify};
+use irradia_sfm::map::{MapOptions, Model, PhotoInfo, Reconstruction, StillRegion, verify};
 use irradia_sfm::matching::PairOptions;
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -17,17 +17,17 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 /// The report, its page, and the folder of its thumbnails.
-const REPORT: &str = "doctor.json";
-const PAGE: &str = "doctor.html";
-const PICTURES: &str = "doctor";
+const REPORT_FILE: &str = "doctor.json";
+const PAGE_FILE: &str = "doctor.html";
+const THUMBNAILS_FOLDER: &str = "doctor";
 /// The page, with a place for the report.
-const TEMPLATE: &str = include_str!("doctor.html");
+const PAGE_TEMPLATE: &str = include_str!("doctor.html");
 /// Longer side of the thumbnails, px.
-const SMALL: u32 = 240;
+const THUMBNAIL_SIDE: u32 = 240;
 /// Maximum number of findings with thumbnails.
-const PICTURED: usize = 60;
+const MAX_FINDINGS_WITH_THUMBNAILS: usize = 60;
 /// Maximum number of points in the plan.
-const PLAN_POINTS: usize = 2000;
+const MAX_PLAN_POINTS: usize = 2000;
 
 /// A request for a diagnosis.
 #[derive(Clone, Debug, PartialEq)]
@@ -78,7 +78,7 @@ pub struct Finding {
     /// Where further photographs would fix it.
     pub shoot: Vec<Place>,
     #[serde(skip)]
-    pictured: Vec<usize>,
+    thumbnail_photos: Vec<usize>,
 }
 
 /// A camera, or a place from which to take a photograph, in the coordinates of the model.
@@ -115,7 +115,7 @@ pub fn doctor(input: &DoctorInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> 
     }
     let capture = Capture::read(&input.photos, input.out.as_deref(), false, progress)?;
     let folder = &capture.folder;
-    check_enough(&input.photos, folder)?;
+    check_photo_count(&input.photos, folder)?;
     let mut work = Work::new(input.max_features, input.out.as_deref(), folder, progress);
     work.find_features()?;
     let pairs = work.match_pairs(&PairOptions::default())?;
@@ -141,7 +141,7 @@ pub(super) fn examine(
     infos: &[PhotoInfo],
     matches: &[PairMatches],
     found: &Reconstruction,
-    masked: Option<&StandsStill>,
+    masked: Option<&StillRegion>,
 ) -> DoctorReport {
     let model = found.models.first();
     let evidence = Evidence {
@@ -156,8 +156,8 @@ pub(super) fn examine(
         models: &found.models,
         zooms: &found.zooms,
         own_focals: found.own_focals,
-        absent: &found.absent,
-        apart: found.apart,
+        missing: &found.missing,
+        split_models: found.split_models,
         left_out: &found.left_out,
     };
     let names: Vec<String> = infos.iter().map(|info| info.name.clone()).collect();
@@ -175,13 +175,13 @@ pub(super) fn examine(
 
 fn finding(diagnosis: &Diagnosis, names: &[String], model: Option<&Model>) -> Finding {
     let (first, second) = diagnosis.sides();
-    let pictured: Vec<usize> = std::iter::once(first).chain(second).collect();
+    let thumbnail_photos: Vec<usize> = std::iter::once(first).chain(second).collect();
     let shoot = model.map_or(Vec::new(), |model| shots(diagnosis, model));
     Finding {
         kind: diagnosis.kind().name(),
         sentence: diagnosis.sentence(names).to_string(),
         photos: diagnosis.photos().into_iter().map(|p| names[p].clone()).collect(),
-        sides: pictured.iter().map(|p| names[*p].clone()).collect(),
+        sides: thumbnail_photos.iter().map(|p| names[*p].clone()).collect(),
         shoot: shoot
             .into_iter()
             .map(|shot| Place {
@@ -190,7 +190,7 @@ fn finding(diagnosis: &Diagnosis, names: &[String], model: Option<&Model>) -> Fi
                 forward: shot.forward.to_array(),
             })
             .collect(),
-        pictured,
+        thumbnail_photos,
     }
 }
 
@@ -201,7 +201,7 @@ pub(super) fn add_unreadable(report: &mut DoctorReport, folder: &PhotoFolder, wo
     let unused = unused.map(|(name, reason)| (name.as_str(), reason.as_str()));
     report
         .findings
-        .extend(by_reason(unused).into_iter().map(|(reason, names)| {
+        .extend(group_by_reason(unused).into_iter().map(|(reason, names)| {
             let who = match &names[..] {
                 [one] => format!("{one} is"),
                 [first, others @ ..] => format!("{first} and {} more are", others.len()),
@@ -213,7 +213,7 @@ pub(super) fn add_unreadable(report: &mut DoctorReport, folder: &PhotoFolder, wo
                 photos: names.into_iter().map(str::to_owned).collect(),
                 sides: Vec::new(),
                 shoot: Vec::new(),
-                pictured: Vec::new(),
+                thumbnail_photos: Vec::new(),
             }
         }));
 }
@@ -231,11 +231,11 @@ fn plan(model: &Model, infos: &[PhotoInfo]) -> Plan {
             })
         })
         .collect();
-    let thin = model.points.len().div_ceil(PLAN_POINTS).max(1);
+    let step = model.points.len().div_ceil(MAX_PLAN_POINTS).max(1);
     let points = model
         .points
         .iter()
-        .step_by(thin)
+        .step_by(step)
         .map(|p| [p.position.x as f32, p.position.y as f32]);
     Plan {
         cameras,
@@ -245,7 +245,7 @@ fn plan(model: &Model, infos: &[PhotoInfo]) -> Plan {
 
 /// Writes the report, its page and its thumbnails.
 pub(super) fn write(out: &Path, folder: &PhotoFolder, work: &Work, report: &DoctorReport) -> Result<(), RunError> {
-    let pictures = out.join(PICTURES);
+    let pictures = out.join(THUMBNAILS_FOLDER);
     if pictures.exists() && out.join("doctor.json").exists() {
         // The thumbnails of an earlier call.
         fs::remove_dir_all(&pictures).map_err(RunError::io("clear", &pictures))?;
@@ -253,36 +253,33 @@ pub(super) fn write(out: &Path, folder: &PhotoFolder, work: &Work, report: &Doct
     let shown: BTreeMap<&str, usize> = report
         .findings
         .iter()
-        .take(PICTURED)
+        .take(MAX_FINDINGS_WITH_THUMBNAILS)
         .flat_map(|finding| {
             finding
                 .sides
                 .iter()
                 .map(String::as_str)
-                .zip(finding.pictured.iter().copied())
+                .zip(finding.thumbnail_photos.iter().copied())
         })
         .collect();
     for (name, photo) in shown {
-        let (size, rgb) = small(&folder.photos[work.photos()[photo]])?;
-        let picture = pictures.join(format!("{name}.png"));
-        let around = picture.parent().unwrap_or(&pictures);
-        fs::create_dir_all(around).map_err(RunError::io("create", around))?;
-        write_png(&picture, size[0], size[1], 3, &rgb)?;
+        let (size, rgb) = thumbnail(&folder.photos[work.photos()[photo]])?;
+        write_png(&pictures.join(format!("{name}.png")), size[0], size[1], 3, &rgb)?;
     }
     let json = to_json(report);
     // Within a script element only `<` can end the data; JSON strings may escape any character.
     let data = String::from_utf8_lossy(&json).replace('<', "\\u003c");
-    let page = TEMPLATE.replace("/*DATA*/", &data);
-    write_atomic(&out.join(REPORT), |file| file.write_all(&json))?;
-    write_atomic(&out.join(PAGE), |file| file.write_all(page.as_bytes()))?;
+    let page = PAGE_TEMPLATE.replace("/*DATA*/", &data);
+    write_atomic(&out.join(REPORT_FILE), |file| file.write_all(&json))?;
+    write_atomic(&out.join(PAGE_FILE), |file| file.write_all(page.as_bytes()))?;
     Ok(())
 }
 
-/// A photograph, reduced by an integer factor to about [`SMALL`]: its size and RGB.
-fn small(photo: &irradia_formats::PhotoEntry) -> Result<([u32; 2], Vec<u8>), RunError> {
-    let pixels = photo.read(SMALL)?;
+/// A photograph, reduced by an integer factor to about [`THUMBNAIL_SIDE`]: its size and RGB.
+fn thumbnail(photo: &irradia_formats::PhotoEntry) -> Result<([u32; 2], Vec<u8>), RunError> {
+    let pixels = photo.read(THUMBNAIL_SIDE)?;
     let size = [pixels.width, pixels.height];
-    let factor = size[0].max(size[1]).div_ceil(SMALL).max(1);
+    let factor = size[0].max(size[1]).div_ceil(THUMBNAIL_SIDE).max(1);
     let to = size.map(|side| (side / factor).max(1));
-    Ok((to, in_rgb(&pixels, to)))
+    Ok((to, to_rgb(&pixels, to)))
 }

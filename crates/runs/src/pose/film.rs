@@ -1,7 +1,7 @@
 //! Selection of frames from films for posing: the sharpest frame of each window, where windows contain equal amounts of motion.
 
 use super::PoseProgress;
-use super::capture::begin;
+use super::capture::prepare_folder;
 use crate::RunError;
 use irradia_formats::write_atomic;
 use irradia_sfm::Features;
@@ -16,26 +16,28 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 /// File extensions of films.
-const FILMS: [&str; 8] = ["mp4", "mov", "m4v", "mkv", "webm", "avi", "mpg", "mpeg"];
+const FILM_EXTENSIONS: [&str; 8] = ["mp4", "mov", "m4v", "mkv", "webm", "avi", "mpg", "mpeg"];
 /// Minimum and maximum number of frames chosen from all films together, unless they have fewer.
-const FRAMES: [usize; 2] = [100, 300];
+const FRAME_COUNT_RANGE: [usize; 2] = [100, 300];
 /// Motion between chosen frames, in frame widths: two thirds of a frame or more stay in view for several frames.
-const SPACING: f64 = 0.05;
+const FRAME_SPACING: f64 = 0.05;
 /// Motion assigned to a frame with too few matches with the frame before, in frame widths.
-const LOST: f64 = 0.1;
+const UNMATCHED_MOTION: f64 = 0.1;
 /// Minimum number of frames from each film, if it has that many.
-const LEAST: usize = 10;
+const MIN_FRAMES_PER_FILM: usize = 10;
 /// Width of the frames in which motion and sharpness are measured, pixels.
-const WIDTH: u32 = 320;
+const MEASURED_WIDTH: u32 = 320;
 /// Number of frames that are measured in parallel.
-const BATCH: usize = 32;
+const BATCH_FRAMES: usize = 32;
 /// Maximum length of a line in the header of ffmpeg's grey images, bytes.
-const LONGEST_LINE: usize = 64;
+const MAX_HEADER_LINE_BYTES: usize = 64;
+/// The exit code of ffmpeg after an interrupt.
+const INTERRUPTED_EXIT_CODE: i32 = 255;
 
 /// Whether `path` has the extension of a film.
 pub fn is_film_name(path: &Path) -> bool {
     let extension = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
-    extension.is_some_and(|e| FILMS.contains(&e.as_str()))
+    extension.is_some_and(|e| FILM_EXTENSIONS.contains(&e.as_str()))
 }
 
 /// Whether `path` is a film by its extension.
@@ -44,7 +46,7 @@ pub(super) fn is_film(path: &Path) -> bool {
 }
 
 /// Whether ffmpeg is installed.
-pub(super) fn can_be_read() -> bool {
+pub(super) fn is_ffmpeg_installed() -> bool {
     ffmpeg_version().is_some()
 }
 
@@ -55,8 +57,8 @@ fn ffmpeg_version() -> Option<String> {
         .stdin(Stdio::null())
         .output()
         .ok()?;
-    let said = String::from_utf8_lossy(&output.stdout).into_owned();
-    output.status.success().then_some(said)
+    let stderr_text = String::from_utf8_lossy(&output.stdout).into_owned();
+    output.status.success().then_some(stderr_text)
 }
 
 /// The option that makes ffmpeg of this `version` pass every frame once: `-fps_mode` is new in 5.1, and later versions removed `-vsync`.
@@ -72,51 +74,54 @@ fn frame_option(version: &str) -> &'static str {
 }
 
 /// The record of the chosen frames, beside them; it is empty at first.
-const RECORD: &str = "frames.json";
+const RECORD_FILE: &str = "frames.json";
 
 /// The frames chosen from a film, recorded so that a later call can reuse them.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
-struct Chosen {
+struct ChosenFrames {
     film: PathBuf,
     bytes: u64,
     modified: Option<std::time::SystemTime>,
     /// Prefix of the frames' names.
     stem: String,
     frames: Vec<usize>,
-    /// Why the film provides no frames.
+    /// Why the film provides no frames, or not all of its frames.
     #[serde(default)]
     damaged: Option<String>,
 }
 
-impl Chosen {
+impl ChosenFrames {
     fn name(&self, frame: usize) -> String {
         format!("{}_{frame:06}.jpg", self.stem)
     }
 
-    /// The film's file name and the reason, if it provides no frames.
+    /// The film's file name and the reason, if it does not provide all of its frames.
     fn left_out(&self) -> Option<(String, String)> {
         let name = self.film.file_name().unwrap_or_default().to_string_lossy().into_owned();
         self.damaged.clone().map(|reason| (name, reason))
     }
 }
 
-/// Writes the chosen frames of `films` as JPEG into `folder`, unless an earlier call already did. Returns the films that cannot be read,
-/// and why; if one of the first `named` films cannot be read, that is an error.
-pub(super) fn frames(
+/// Writes the chosen frames of `films` as JPEG into `folder`, unless an earlier call already did. Returns the films of which not all frames
+/// can be read, and why; if none of the frames of one of the first `named` films can be read, that is an error.
+pub(super) fn write_frames(
     films: &[PathBuf],
     named: usize,
     folder: &Path,
     progress: &(dyn Fn(PoseProgress) + Sync),
 ) -> Result<Vec<(String, String)>, RunError> {
-    let record = folder.join(RECORD);
-    let mut chosen = films.iter().map(|film| of_file(film)).collect::<Result<Vec<_>, _>>()?;
+    let record = folder.join(RECORD_FILE);
+    let mut chosen = films
+        .iter()
+        .map(|film| empty_selection(film))
+        .collect::<Result<Vec<_>, _>>()?;
     for i in 0..chosen.len() {
         // Films in different folders may have the same name.
         if chosen[..i].iter().any(|other| other.stem == chosen[i].stem) {
             chosen[i].stem = format!("{}_{}", chosen[i].stem, i + 1);
         }
     }
-    let known: Option<Vec<Chosen>> = fs::read(&record)
+    let known: Option<Vec<ChosenFrames>> = fs::read(&record)
         .ok()
         .and_then(|bytes| serde_json::from_slice(&bytes).ok());
     if let Some(known) = known.filter(|known| known.len() == chosen.len()) {
@@ -128,7 +133,7 @@ pub(super) fn frames(
             .iter()
             .flat_map(|film| film.frames.iter().map(|frame| film.name(*frame)));
         if known == chosen && names.all(|name| folder.join(name).is_file()) {
-            return Ok(chosen.iter().filter_map(Chosen::left_out).collect());
+            return Ok(chosen.iter().filter_map(ChosenFrames::left_out).collect());
         }
     }
     progress(PoseProgress::Stage { name: "frames", of: 0 });
@@ -136,13 +141,16 @@ pub(super) fn frames(
     let mut measured = Vec::new();
     for (i, film) in films.iter().enumerate() {
         let frames = match measure(film, before, progress) {
-            Ok(frames) => frames,
+            Ok((frames, unread)) => {
+                chosen[i].damaged = unread;
+                frames
+            }
             // Without ffmpeg, a film is not damaged: it can be read once ffmpeg is installed.
-            Err(error) if i < named || !can_be_read() => return Err(error),
+            Err(error) if i < named || !is_ffmpeg_installed() => return Err(error),
             Err(error) => {
-                let said = error.to_string();
+                let message = error.to_string();
                 let path = format!("{}: ", film.display());
-                chosen[i].damaged = Some(said.strip_prefix(&path).unwrap_or(&said).to_owned());
+                chosen[i].damaged = Some(message.strip_prefix(&path).unwrap_or(&message).to_owned());
                 Vec::new()
             }
         };
@@ -150,21 +158,21 @@ pub(super) fn frames(
         measured.push(frames);
     }
     // Frames of an earlier selection must not be used as photographs.
-    begin(folder, RECORD)?;
-    for ((chosen, frames), wanted) in chosen.iter_mut().zip(&measured).zip(shares(&measured)) {
+    prepare_folder(folder, RECORD_FILE)?;
+    for ((chosen, frames), wanted) in chosen.iter_mut().zip(&measured).zip(frame_counts(&measured)) {
         if !frames.is_empty() {
             chosen.frames = choose(frames, wanted);
             extract(chosen, folder)?;
         }
     }
     write_atomic(&record, |file| file.write_all(&crate::folder::to_json(&chosen)))?;
-    Ok(chosen.iter().filter_map(Chosen::left_out).collect())
+    Ok(chosen.iter().filter_map(ChosenFrames::left_out).collect())
 }
 
 /// A film without chosen frames.
-fn of_file(film: &Path) -> Result<Chosen, RunError> {
+fn empty_selection(film: &Path) -> Result<ChosenFrames, RunError> {
     let metadata = fs::metadata(film).map_err(RunError::io("read", film))?;
-    Ok(Chosen {
+    Ok(ChosenFrames {
         film: std::path::absolute(film).unwrap_or_else(|_| film.to_owned()),
         bytes: metadata.len(),
         modified: metadata.modified().ok(),
@@ -176,16 +184,16 @@ fn of_file(film: &Path) -> Result<Chosen, RunError> {
 
 /// Number of frames to choose from each film: the total depends on the motion of all films and is distributed in proportion to the motion
 /// of each.
-fn shares(films: &[Vec<Frame>]) -> Vec<usize> {
+fn frame_counts(films: &[Vec<Frame>]) -> Vec<usize> {
     let motion = |frames: &Vec<Frame>| frames.iter().map(|frame| frame.motion).sum::<f64>();
     let total: f64 = films.iter().map(motion).sum();
-    let wanted = ((total / SPACING) as usize).clamp(FRAMES[0], FRAMES[1]);
+    let wanted = ((total / FRAME_SPACING) as usize).clamp(FRAME_COUNT_RANGE[0], FRAME_COUNT_RANGE[1]);
     let share = |frames: &Vec<Frame>| match total > 0.0 {
         true => motion(frames) / total,
         // Cameras that stand still.
         false => 1.0 / films.len() as f64,
     };
-    let count = |frames| ((share(frames) * wanted as f64).round() as usize).max(LEAST);
+    let count = |frames| ((share(frames) * wanted as f64).round() as usize).max(MIN_FRAMES_PER_FILM);
     films.iter().map(count).collect()
 }
 
@@ -198,12 +206,15 @@ struct Frame {
     sharpness: f64,
 }
 
+/// Frames that can be read, and why others cannot, if there are any.
+type Measured = (Vec<Frame>, Option<String>);
+
 /// Measures all frames of a film, at a reduced size; `before` frames of other films have already been measured.
-fn measure(film: &Path, before: usize, progress: &(dyn Fn(PoseProgress) + Sync)) -> Result<Vec<Frame>, RunError> {
+fn measure(film: &Path, before: usize, progress: &(dyn Fn(PoseProgress) + Sync)) -> Result<Measured, RunError> {
     let mut child = Command::new("ffmpeg")
         .args(["-loglevel", "error", "-i"])
         .arg(file_url(film))
-        .args(["-vf", &format!("scale={WIDTH}:-2")])
+        .args(["-vf", &format!("scale={MEASURED_WIDTH}:-2")])
         .args([frame_option(&ffmpeg_version().unwrap_or_default()), "passthrough"])
         .args(["-f", "image2pipe", "-c:v", "pgm", "-pix_fmt", "gray", "-"])
         .stdin(Stdio::null())
@@ -214,11 +225,11 @@ fn measure(film: &Path, before: usize, progress: &(dyn Fn(PoseProgress) + Sync))
     let mut pictures = BufReader::with_capacity(1 << 20, child.stdout.take().expect("a pipe"));
     // Errors are read concurrently: a full pipe would block ffmpeg.
     let mut errors = child.stderr.take().expect("a pipe");
-    let said = std::thread::spawn(move || {
-        let mut said = String::new();
+    let stderr_text = std::thread::spawn(move || {
+        let mut stderr_text = String::new();
         // Best effort: it only explains a failure.
-        let _ = errors.read_to_string(&mut said);
-        said
+        let _ = errors.read_to_string(&mut stderr_text);
+        stderr_text
     });
     let sift = Sift {
         max_features: 400,
@@ -227,7 +238,9 @@ fn measure(film: &Path, before: usize, progress: &(dyn Fn(PoseProgress) + Sync))
     let mut frames = Vec::new();
     let mut last: Option<Features> = None;
     loop {
-        let batch: Vec<Picture> = std::iter::from_fn(|| read_picture(&mut pictures)).take(BATCH).collect();
+        let batch: Vec<Picture> = std::iter::from_fn(|| read_picture(&mut pictures))
+            .take(BATCH_FRAMES)
+            .collect();
         if batch.is_empty() {
             break;
         }
@@ -253,14 +266,30 @@ fn measure(film: &Path, before: usize, progress: &(dyn Fn(PoseProgress) + Sync))
     // Where a frame could not be read, ffmpeg would wait forever for a reader.
     drop(pictures);
     let status = child.wait().map_err(RunError::io("read", film))?;
-    let said = said.join().unwrap_or_default();
-    if !status.success() {
-        return Err(unreadable(film, &said));
+    let stderr_text = stderr_text.join().unwrap_or_default();
+    // Killed or interrupted: the film may be sound.
+    if status.code().is_none_or(|code| code == INTERRUPTED_EXIT_CODE) {
+        return Err(unreadable(film, &stderr_text));
     }
-    if frames.is_empty() {
-        return Err(RunError::Refused(format!("{}: the film has no frames", film.display())));
+    check_decoded(film, frames, (!status.success()).then_some(stderr_text.as_str()))
+}
+
+/// The frames that ffmpeg decoded. If it `failed`, with this text, others are damaged: ffmpeg leaves them out, and fails if they are most
+/// of the film (its option `-max_error_rate`).
+fn check_decoded(film: &Path, frames: Vec<Frame>, failed: Option<&str>) -> Result<Measured, RunError> {
+    match failed {
+        Some(stderr_text) if frames.is_empty() => Err(unreadable(film, stderr_text)),
+        Some(stderr_text) => {
+            let unread = format!(
+                "frames that ffmpeg cannot read ({}); it reads the other {}",
+                last_line(stderr_text),
+                frames.len()
+            );
+            Ok((frames, Some(unread)))
+        }
+        None if frames.is_empty() => Err(RunError::Refused(format!("{}: the film has no frames", film.display()))),
+        None => Ok((frames, None)),
     }
-    Ok(frames)
 }
 
 /// The URL of a film for ffmpeg; a plain file name might look like another protocol.
@@ -277,9 +306,14 @@ fn no_ffmpeg(film: &Path, error: &std::io::Error) -> RunError {
     ))
 }
 
-fn unreadable(film: &Path, said: &str) -> RunError {
-    let last = said.lines().last().unwrap_or("no reason given");
-    RunError::Refused(format!("{}: ffmpeg cannot read the film: {last}", film.display()))
+fn unreadable(film: &Path, stderr_text: &str) -> RunError {
+    let reason = last_line(stderr_text);
+    RunError::Refused(format!("{}: ffmpeg cannot read the film: {reason}", film.display()))
+}
+
+/// The reason that ffmpeg gives last.
+fn last_line(stderr_text: &str) -> &str {
+    stderr_text.lines().last().unwrap_or("no reason given")
 }
 
 /// A grey image.
@@ -321,7 +355,7 @@ fn read_picture(stream: &mut impl Read) -> Option<Picture> {
     let size = read_line(stream)?;
     let (width, height) = size.split_once(' ')?;
     let [width, height]: [u32; 2] = [width.parse().ok()?, height.parse().ok()?];
-    if read_line(stream)? != "255" || width != WIDTH || height > 64 * WIDTH {
+    if read_line(stream)? != "255" || width != MEASURED_WIDTH || height > 64 * MEASURED_WIDTH {
         return None;
     }
     let mut data = vec![0; width as usize * height as usize];
@@ -336,7 +370,7 @@ fn read_line(stream: &mut impl Read) -> Option<String> {
         stream.read_exact(&mut byte).ok()?;
         match byte[0] {
             b'\n' => return String::from_utf8(line).ok(),
-            _ if line.len() == LONGEST_LINE => return None,
+            _ if line.len() == MAX_HEADER_LINE_BYTES => return None,
             other => line.push(other),
         }
     }
@@ -352,10 +386,10 @@ fn motion(before: &Features, after: &Features) -> f64 {
         })
         .collect();
     if distances.len() < 8 {
-        return LOST;
+        return UNMATCHED_MOTION;
     }
     distances.sort_by(f32::total_cmp);
-    f64::from(distances[distances.len() / 2]) / f64::from(WIDTH)
+    f64::from(distances[distances.len() / 2]) / f64::from(MEASURED_WIDTH)
 }
 
 /// The sharpest frame of each of `wanted` windows that are equal in motion.
@@ -383,19 +417,19 @@ fn choose(frames: &[Frame], wanted: usize) -> Vec<usize> {
 }
 
 /// The expression by which ffmpeg selects frames: a balanced sum, since it evaluates at most a hundred terms in a row.
-fn is_one_of(frames: &[usize]) -> String {
+fn selection_expression(frames: &[usize]) -> String {
     match frames {
         [] => "0".to_owned(),
         [frame] => format!("eq(n,{frame})"),
         several => {
             let (first, second) = several.split_at(several.len() / 2);
-            format!("({}+{})", is_one_of(first), is_one_of(second))
+            format!("({}+{})", selection_expression(first), selection_expression(second))
         }
     }
 }
 
 /// Writes the chosen frames, which are in ascending order, under their names.
-fn extract(chosen: &Chosen, folder: &Path) -> Result<(), RunError> {
+fn extract(chosen: &ChosenFrames, folder: &Path) -> Result<(), RunError> {
     let film = &chosen.film;
     let output = Command::new("ffmpeg")
         .args(["-loglevel", "error", "-y", "-i"])
@@ -403,7 +437,7 @@ fn extract(chosen: &Chosen, folder: &Path) -> Result<(), RunError> {
         .args([
             "-vf",
             // Non-square pixels (DV, anamorphic) are made square: the cameras have one focal length.
-            &format!("select='{}',scale=iw*sar:ih", is_one_of(&chosen.frames)),
+            &format!("select='{}',scale=iw*sar:ih", selection_expression(&chosen.frames)),
         ])
         .args([frame_option(&ffmpeg_version().unwrap_or_default()), "passthrough"])
         // A relative pattern, since the path of the folder may contain a `%`.
@@ -412,14 +446,13 @@ fn extract(chosen: &Chosen, folder: &Path) -> Result<(), RunError> {
         .stdin(Stdio::null())
         .output()
         .map_err(|error| no_ffmpeg(film, &error))?;
-    if !output.status.success() {
+    let written = |i: usize| folder.join(format!("chosen_{i:06}.jpg"));
+    // A film with damaged parts: ffmpeg fails, but has written the frames that can be read.
+    if !output.status.success() && !(0..chosen.frames.len()).all(|i| written(i).is_file()) {
         return Err(unreadable(film, &String::from_utf8_lossy(&output.stderr)));
     }
     for (i, frame) in chosen.frames.iter().enumerate() {
-        let (from, to) = (
-            folder.join(format!("chosen_{i:06}.jpg")),
-            folder.join(chosen.name(*frame)),
-        );
+        let (from, to) = (written(i), folder.join(chosen.name(*frame)));
         fs::rename(&from, &to).map_err(RunError::io("write", &to))?;
     }
     Ok(())
@@ -445,6 +478,28 @@ mod tests {
     }
 
     #[test]
+    fn damaged_parts_of_a_film_do_not_cost_its_other_frames() {
+        let frame = Frame {
+            motion: 0.1,
+            sharpness: 1.0,
+        };
+        let read = |frames: usize, failed| check_decoded("walk.mp4".as_ref(), vec![frame; frames], failed);
+        let stderr_text = "moov\nInvalid data found";
+        let (frames, unread) = read(7, Some(stderr_text)).unwrap();
+        assert_eq!(frames.len(), 7);
+        let unread = unread.unwrap();
+        assert!(
+            unread.contains("(Invalid data found)") && unread.contains("other 7"),
+            "{unread}"
+        );
+        assert_eq!(read(7, None).unwrap().1, None);
+        for (failed, reason) in [(Some(stderr_text), "Invalid data found"), (None, "no frames")] {
+            let error = read(0, failed).unwrap_err().to_string();
+            assert!(error.contains("walk.mp4") && error.contains(reason), "{error}");
+        }
+    }
+
+    #[test]
     fn windows_are_equal_in_motion_and_give_their_sharpest_frame() {
         // A still half, then a moving one; every third frame is sharp.
         let frame = |i: usize| Frame {
@@ -464,16 +519,16 @@ mod tests {
         assert_eq!(choose(&still, 100).len(), 100);
         assert_eq!(choose(&frames[..40], 100).len(), 40);
         // A moving film and a still one share the total.
-        assert_eq!(shares(&[frames, still.clone()]), [300, LEAST]);
-        assert_eq!(shares(&[still.clone(), still]), [50, 50]);
+        assert_eq!(frame_counts(&[frames, still.clone()]), [300, MIN_FRAMES_PER_FILM]);
+        assert_eq!(frame_counts(&[still.clone(), still]), [50, 50]);
     }
 
     #[test]
     fn frames_are_selected_by_a_sum_that_is_nowhere_deep() {
-        assert_eq!(is_one_of(&[3, 7, 9]), "(eq(n,3)+(eq(n,7)+eq(n,9)))");
+        assert_eq!(selection_expression(&[3, 7, 9]), "(eq(n,3)+(eq(n,7)+eq(n,9)))");
         let frames: Vec<usize> = (0..300).map(|i| 3 * i).collect();
         let (mut depth, mut deepest) = (0usize, 0);
-        let text = is_one_of(&frames);
+        let text = selection_expression(&frames);
         for c in text.chars() {
             match c {
                 '(' => depth += 1,

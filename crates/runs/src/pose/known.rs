@@ -2,10 +2,10 @@
 
 use crate::RunError;
 use glam::{DQuat, DVec3};
-use irradia_formats::{Beside, ColmapCamera, ColmapImage, PhotoFolder, read_colmap_poses, read_photo_folders};
+use irradia_formats::{ColmapCamera, ColmapImage, PhotoFolder, SiblingFolder, read_colmap_poses, read_photo_folders};
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::geometry::pose::DPose;
-use irradia_sfm::map::{Known, PhotoInfo};
+use irradia_sfm::map::{KnownGeometry, PhotoInfo};
 use std::collections::{BTreeSet, HashMap};
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
@@ -37,13 +37,13 @@ impl KnownPoses {
         let folders = self.images.keys().map(|name| images.join(name));
         let folders: BTreeSet<PathBuf> = folders.filter_map(|photo| Some(photo.parent()?.to_owned())).collect();
         let folders: Vec<PathBuf> = folders.into_iter().filter(|folder| folder.is_dir()).collect();
-        let masks = Beside::masks(&self.data, "images");
+        let masks = SiblingFolder::masks(&self.data, "images");
         let mut found = read_photo_folders(&folders)?;
         for photo in &mut found.photos {
             let inside = photo.path.strip_prefix(&images).unwrap_or(&photo.path);
             let parts = inside.iter().map(OsStr::to_string_lossy);
             photo.name = parts.collect::<Vec<_>>().join("/");
-            let mask = masks.as_ref().and_then(|masks| masks.of(&photo.name));
+            let mask = masks.as_ref().and_then(|masks| masks.file_of(&photo.name));
             if let (None, Some(mask)) = (&photo.mask, mask) {
                 *photo = photo.with_mask(mask)?;
             }
@@ -52,7 +52,7 @@ impl KnownPoses {
     }
 
     /// The dataset's photographs and those of `more`, by name.
-    pub fn with(&self, more: PhotoFolder) -> Result<PhotoFolder, RunError> {
+    pub fn combined_with(&self, more: PhotoFolder) -> Result<PhotoFolder, RunError> {
         let mut folder = self.photographs()?;
         let present = |name: &&String| folder.photos.iter().any(|photo| photo.name == **name);
         if let Some(name) = self.images.keys().filter(|name| !present(name)).min() {
@@ -96,7 +96,7 @@ impl KnownPoses {
 
     /// The known poses and cameras of `photos`, whose groups are replaced by those of the dataset's cameras: new photographs join the
     /// camera of photographs with the same metadata.
-    pub fn of(&self, photos: &mut [PhotoInfo]) -> Result<Known, RunError> {
+    pub fn geometry_of(&self, photos: &mut [PhotoInfo]) -> Result<KnownGeometry, RunError> {
         let of_photo: Vec<Option<&ColmapImage>> = photos.iter().map(|photo| self.images.get(&photo.name)).collect();
         for (photo, image) in photos.iter().zip(&of_photo) {
             let Some(camera) = image.and_then(|image| self.cameras.get(&image.camera_id)) else {
@@ -147,7 +147,7 @@ impl KnownPoses {
             Group::Camera(id) => self.camera(*id).map(Some),
             Group::New(_) => Ok(None),
         };
-        Ok(Known {
+        Ok(KnownGeometry {
             poses: of_photo.iter().map(|image| image.map(pose)).collect(),
             cameras: groups.iter().map(camera).collect::<Result<_, _>>()?,
         })

@@ -12,20 +12,20 @@
 //! ```
 
 mod attempt;
-mod brought;
 mod capture;
 mod check;
 mod colmap;
 mod doctor;
+mod feature_store;
 mod film;
+mod import;
 mod known;
-mod look;
+mod metric_scale;
 mod output;
-mod place;
 mod points;
 mod stages;
 mod still;
-mod store;
+mod view_features;
 
 use crate::RunError;
 use crate::folder::to_json;
@@ -46,14 +46,14 @@ pub use check::{PoseCheck, check_poses};
 pub use doctor::{DoctorInput, DoctorReport, Finding, doctor};
 use film::is_film;
 pub use film::is_film_name;
-pub(crate) use points::{are_missing, find_points};
+pub(crate) use points::{find_points, lacks_points};
 
 /// The fraction of the photographs that should have a pose: below it, a second attempt is made, and training does not start automatically.
-pub const ENOUGH_POSED: f64 = 0.8;
+pub const MIN_POSED_FRACTION: f64 = 0.8;
 /// Minimum number of photographs of a dataset.
 const MIN_PHOTOS: usize = 3;
 /// File name of the report.
-const REPORT: &str = "pose.json";
+const REPORT_FILE: &str = "pose.json";
 
 /// A request for poses.
 #[derive(Clone, Debug, PartialEq)]
@@ -62,7 +62,8 @@ pub struct PoseInput {
     pub photos: Vec<PathBuf>,
     /// The folder of the dataset; created if missing.
     pub out: PathBuf,
-    /// File names of the photographs to use; others beside them are ignored. Has no effect unless all of them are found. `None`: all.
+    /// File names of the photographs to use, each with or without its extension; others beside them are ignored. Has no effect unless all of
+    /// them are found. `None`: all.
     pub only: Option<HashSet<String>>,
     /// Whether to add the photographs to the dataset in `out`, in COLMAP's format, whose poses and cameras do not change.
     pub into: bool,
@@ -165,13 +166,13 @@ pub struct PoseReport {
     /// What is wrong with the capture, the most serious first.
     pub findings: Vec<Finding>,
     /// The program that found the poses.
-    pub poses_by: PosesBy,
+    pub poses_by: PoseSource,
 }
 
 /// The program that found the poses of a dataset.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum PosesBy {
+pub enum PoseSource {
     /// This program, which has checked them.
     #[default]
     Irradia,
@@ -211,7 +212,7 @@ pub struct LeftOutPhoto {
 }
 
 /// Groups the names of `named`, each a `(name, reason)`, by reason; reasons are in the order of their first occurrence.
-pub fn by_reason<'a>(named: impl Iterator<Item = (&'a str, &'a str)>) -> Vec<(&'a str, Vec<&'a str>)> {
+pub fn group_by_reason<'a>(named: impl Iterator<Item = (&'a str, &'a str)>) -> Vec<(&'a str, Vec<&'a str>)> {
     let mut reasons: Vec<(&str, Vec<&str>)> = Vec::new();
     for (name, reason) in named {
         match reasons.iter_mut().find(|(other, _)| *other == reason) {
@@ -267,8 +268,8 @@ pub struct StageReport {
 
 /// Finds the poses of photographs and writes them as a dataset. Features and matches of an earlier call are reused.
 ///
-/// If fewer than [`ENOUGH_POSED`] of the photographs have a pose at first, or any of up to 25 photographs has none, or pairs of up to 25
-/// contradict the model, a second attempt is made with frontal descriptors. Its model replaces the first one if it is larger by a
+/// If fewer than [`MIN_POSED_FRACTION`] of the photographs have a pose at first, or any of up to 25 photographs has none, or pairs of up to
+/// 25 contradict the model, a second attempt is made with frontal descriptors. Its model replaces the first one if it is larger by a
 /// twentieth of the photographs and contains half of them, or if it is as large and contradicted half as often.
 ///
 /// The result depends neither on the number of threads nor on the order of the files.
@@ -298,22 +299,23 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
         }
     };
     fs::create_dir_all(out).map_err(RunError::io("create", out))?;
-    let mut clock = Clock::new();
+    let mut clock = StageTimer::new();
     let mut capture = Capture::read(&input.photos, Some(out), input.into, progress)?;
-    still::ignore_own(&mut capture.folder.photos, out)?;
+    still::ignore_own_masks(&mut capture.folder.photos, out)?;
     if let Some(only) = &input.only {
-        let is_one = |photo: &PhotoEntry| only.contains(&photo.name);
+        let bare = |name: &str| name.rsplit_once('.').map_or(name, |(bare, _)| bare).to_owned();
+        let is_one = |photo: &PhotoEntry| only.contains(&photo.name) || only.contains(&bare(&photo.name));
         if capture.folder.photos.iter().filter(|photo| is_one(photo)).count() == only.len() {
             capture.folder.photos.retain(is_one);
         }
     }
     if let Some(known) = &known {
-        capture.folder = known.with(capture.folder)?;
+        capture.folder = known.combined_with(capture.folder)?;
     }
     let mut folder = &capture.folder;
-    check_enough(&input.photos, folder)?;
-    place::check(&input.distances, folder)?;
-    brought::clear_beside(out, &folder.photos)?;
+    check_photo_count(&input.photos, folder)?;
+    metric_scale::check_distances(&input.distances, folder)?;
+    import::clear_stale(out, &folder.photos)?;
     clock.end("photographs");
     if input.mapper == Mapper::Colmap {
         if !input.distances.is_empty() {
@@ -331,19 +333,19 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
             ));
         }
         let mut report = colmap::run(input, &capture, progress)?;
-        report.poses_by = PosesBy::Colmap;
+        report.poses_by = PoseSource::Colmap;
         clock.end("colmap");
         report.stages = clock.stages;
         report.seconds = started.elapsed().as_secs_f64();
-        write_atomic(&out.join(REPORT), |file| file.write_all(&to_json(&report)))?;
+        write_atomic(&out.join(REPORT_FILE), |file| file.write_all(&to_json(&report)))?;
         return Ok(report);
     }
 
     let is_new = known.is_none();
     let into = known.as_ref().map(|known| known.model.clone());
     let by = match into {
-        Some(_) => poses_by(out).unwrap_or(PosesBy::Others),
-        None => PosesBy::Irradia,
+        Some(_) => pose_source(out).unwrap_or(PoseSource::Others),
+        None => PoseSource::Irradia,
     };
     let work = Work::new(input.max_features, Some(out), folder, progress);
     let mut matched = Matched::find(work, &capture, false, &mut clock)?;
@@ -358,10 +360,10 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     }
     let mut attempt = matched.map(&input.mapping, known, &mut clock, progress)?;
     let mut attempts = vec![attempt.report()];
-    if is_new && let Some(why) = attempt.falls_short() {
-        let work = attempt.again(input.max_features, out);
+    if is_new && let Some(why) = attempt.retry_reason() {
+        let work = attempt.retry(input.max_features, out);
         let most = work.sift().max_features;
-        let guided = match attempt::may_be_guided(folder.photos.len()) {
+        let guided = match attempt::can_be_guided(folder.photos.len()) {
             true => " and along epipolar lines",
             false => "",
         };
@@ -375,15 +377,15 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
             attempt = again;
         }
     }
-    let told = match &masked {
-        Some(masked) => Some(masked.told.clone()),
+    let mask_message = match &masked {
+        Some(masked) => Some(masked.message.clone()),
         None if is_new && !capture.has_panoramas() => match still::mask_backdrop(&attempt, folder, out, progress)? {
-            None => still::mask_edited(&attempt, folder, out, progress)?,
-            told => told,
+            None => still::mask_bars_and_text(&attempt, folder, out, progress)?,
+            mask_message => mask_message,
         },
         None => None,
     };
-    if masked.is_none() && told.is_some() {
+    if masked.is_none() && mask_message.is_some() {
         clock.end("masks");
     }
     let Attempt {
@@ -398,19 +400,19 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     let scale = match reconstruction.models.first_mut() {
         // Known poses keep their unit.
         Some(model) if is_new => {
-            let by_places = place::scale(folder, &mut work, model);
-            place::scale_by_distances(&input.distances, &infos, &mut work, model)?.or(by_places)
+            let gps_scale = metric_scale::scale_by_gps(folder, &mut work, model);
+            metric_scale::scale_by_distances(&input.distances, &infos, &mut work, model)?.or(gps_scale)
         }
         _ => None,
     };
     clock.end("poses");
-    let stood_still = masked.as_ref().map(|masked| &masked.still);
-    let mut examined = doctor::examine(&work, &infos, &pairs, &reconstruction, stood_still);
+    let still_region = masked.as_ref().map(|masked| &masked.still);
+    let mut examined = doctor::examine(&work, &infos, &pairs, &reconstruction, still_region);
     doctor::add_unreadable(&mut examined, folder, &work);
     doctor::write(out, folder, &work, &examined)?;
     clock.end("doctor");
     if reconstruction.models.is_empty() {
-        return Err(RunError::Refused(no_model(
+        return Err(RunError::Refused(no_model_message(
             &input.photos,
             &infos,
             &reconstruction,
@@ -427,30 +429,30 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
     report.attempts = attempts;
     report.pairs = pairs.len();
     report.warnings = work.warnings().to_vec();
-    report.warnings.extend(told);
+    report.warnings.extend(mask_message);
     report.stages = clock.stages;
     report.seconds = started.elapsed().as_secs_f64();
-    write_atomic(&out.join(REPORT), |file| file.write_all(&to_json(&report)))?;
+    write_atomic(&out.join(REPORT_FILE), |file| file.write_all(&to_json(&report)))?;
     Ok(report)
 }
 
 /// The program that found the poses in `data`, if [`pose`] wrote the model there or added to it.
-pub fn poses_by(data: &Path) -> Option<PosesBy> {
+pub fn pose_source(data: &Path) -> Option<PoseSource> {
     #[derive(Deserialize)]
-    struct Known {
+    struct StoredReport {
         // Missing in reports of earlier versions.
         #[serde(default)]
-        poses_by: PosesBy,
+        poses_by: PoseSource,
     }
-    let report = fs::read(data.join(REPORT)).ok()?;
-    Some(serde_json::from_slice::<Known>(&report).map_or(PosesBy::Irradia, |known| known.poses_by))
+    let report = fs::read(data.join(REPORT_FILE)).ok()?;
+    Some(serde_json::from_slice::<StoredReport>(&report).map_or(PoseSource::Irradia, |known| known.poses_by))
 }
 
 /// Rejects an output folder with a model that [`pose`] did not write.
 fn check_free(out: &Path) -> Result<(), RunError> {
     let foreign = ["sparse", "transforms.json", "transforms_train.json", "poses_bounds.npy"]
         .into_iter()
-        .find(|name| out.join(name).exists() && matches!(poses_by(out), None | Some(PosesBy::Others)));
+        .find(|name| out.join(name).exists() && matches!(pose_source(out), None | Some(PoseSource::Others)));
     match foreign {
         Some(name) => Err(RunError::Refused(format!(
             "{} already contains {name} from another source: choose another --out",
@@ -460,7 +462,7 @@ fn check_free(out: &Path) -> Result<(), RunError> {
     }
 }
 
-fn check_enough(paths: &[PathBuf], folder: &PhotoFolder) -> Result<(), RunError> {
+fn check_photo_count(paths: &[PathBuf], folder: &PhotoFolder) -> Result<(), RunError> {
     if folder.photos.len() >= MIN_PHOTOS {
         return Ok(());
     }
@@ -471,20 +473,25 @@ fn check_enough(paths: &[PathBuf], folder: &PhotoFolder) -> Result<(), RunError>
         .collect();
     Err(RunError::Refused(format!(
         "{}: {} readable photographs, at least {MIN_PHOTOS} of different views are needed{reasons}",
-        joined(paths),
+        join_paths(paths),
         folder.photos.len()
     )))
 }
 
 /// Paths as text for a message.
-fn joined(paths: &[PathBuf]) -> String {
+fn join_paths(paths: &[PathBuf]) -> String {
     let paths: Vec<String> = paths.iter().map(|path| path.display().to_string()).collect();
     paths.join(", ")
 }
 
 /// Why nothing could be posed, and what to do: masks or too little texture if these affect more than half of the photographs, otherwise the
 /// doctor's first finding other than a left-out photograph, otherwise the first photograph's reason.
-fn no_model(paths: &[PathBuf], photos: &[PhotoInfo], found: &Reconstruction, examined: &DoctorReport) -> String {
+fn no_model_message(
+    paths: &[PathBuf],
+    photos: &[PhotoInfo],
+    found: &Reconstruction,
+    examined: &DoctorReport,
+) -> String {
     let count = |kind: Kind| {
         examined
             .findings
@@ -514,18 +521,18 @@ fn no_model(paths: &[PathBuf], photos: &[PhotoInfo], found: &Reconstruction, exa
     };
     format!(
         "{}: no three of {} photographs could be posed together; {reason}",
-        joined(paths),
+        join_paths(paths),
         photos.len()
     )
 }
 
 /// Measures the time of each stage.
-struct Clock {
+struct StageTimer {
     last: Instant,
     stages: Vec<StageReport>,
 }
 
-impl Clock {
+impl StageTimer {
     fn new() -> Self {
         Self {
             last: Instant::now(),

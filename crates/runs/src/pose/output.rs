@@ -1,8 +1,8 @@
 //! Writing of the reconstructed dataset and its report.
 
-use super::brought;
+use super::import;
 use super::stages::Work;
-use super::{CameraReport, LeftOutPhoto, PoseReport, PosesBy, poses_by};
+use super::{CameraReport, LeftOutPhoto, PoseReport, PoseSource, pose_source};
 use crate::RunError;
 use irradia_formats::{
     ColmapCamera, ColmapImage, ColmapModel, ColmapPoint, PhotoEntry, PhotoFolder, PosedImage, TrackedPoint,
@@ -15,7 +15,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 /// Writes `images` and `sparse`, or replaces the model in the folder `into`, to which photographs were added. Without `into`, files of
-/// other photographs that an earlier call brought are put away.
+/// other photographs that an earlier call imported are moved to `unused`.
 pub(super) fn write(
     out: &Path,
     folder: &PhotoFolder,
@@ -31,7 +31,7 @@ pub(super) fn write(
             .then_some(&folder.photos[*i])
     };
     let posed: Vec<&PhotoEntry> = work.photos().iter().enumerate().filter_map(has_pose).collect();
-    posed.iter().try_for_each(|photo| brought::bring_photo(out, photo))?;
+    posed.iter().try_for_each(|photo| import::import_photo(out, photo))?;
     let written = begin_models(out)?;
     for (number, model) in found.models.iter().enumerate() {
         let to = written.join(number.to_string());
@@ -42,7 +42,7 @@ pub(super) fn write(
         Some(model) => replace_model(out, model, &written)?,
         None => end_models(out, &written)?,
     }
-    brought::record(out, &posed, into.is_some())
+    import::record(out, &posed, into.is_some())
 }
 
 /// An empty folder for models, beside those of an earlier call, which may be more and remain until the new ones are complete.
@@ -64,18 +64,18 @@ pub(super) fn end_models(out: &Path, written: &Path) -> Result<(), RunError> {
     fs::rename(written, &sparse).map_err(RunError::io("rename", written))
 }
 
-/// Replaces the model in the folder `model` by the first one of `written`. The old model is put away if another program made it; other
-/// models and files stay.
+/// Replaces the model in the folder `model` by the first one of `written`. The old model is moved to `unused` if another program made it;
+/// other models and files stay.
 fn replace_model(out: &Path, model: &Path, written: &Path) -> Result<(), RunError> {
     let tables = ["cameras", "images", "points3D", "rigs", "frames"];
     let names = tables
         .into_iter()
         .flat_map(|table| ["bin", "txt"].map(|extension| format!("{table}.{extension}")));
     let names: Vec<String> = names.collect();
-    if poses_by(out).is_none() {
+    if pose_source(out).is_none() {
         let place = model.strip_prefix(out).unwrap_or(model);
         let files = names.iter().map(|name| place.join(name).to_string_lossy().into_owned());
-        brought::put_away(out, files)?;
+        import::move_to_unused(out, files)?;
         // The folder was removed with the last of its files.
         fs::create_dir_all(model).map_err(RunError::io("create", model))?;
     }
@@ -243,6 +243,6 @@ pub(super) fn report(folder: &PhotoFolder, work: &Work, infos: &[PhotoInfo], fou
         seconds: 0.0,
         warnings: Vec::new(),
         findings: Vec::new(),
-        poses_by: PosesBy::Irradia,
+        poses_by: PoseSource::Irradia,
     }
 }

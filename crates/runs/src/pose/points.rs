@@ -3,27 +3,27 @@
 //! Datasets of LLFF, of instant-ngp or from a phone's tracking have no points. Splats then begin at random positions, and nothing shows
 //! which space is empty: the same photographs of fox at 540x960, by the same recipe in the same time, are 2 dB worse (RESULTS.md).
 
-use super::look::{Look, pose};
 use super::output::mean_color;
 use super::stages::max_features;
+use super::view_features::{ViewFeatures, pose};
 use irradia_scene::{Dataset, Lens, PointCloud};
 use irradia_sfm::features::Sift;
-use irradia_sfm::map::{Known, MapOptions, PhotoInfo, add_guided_points, extend};
+use irradia_sfm::map::{KnownGeometry, MapOptions, PhotoInfo, add_guided_points, extend};
 use irradia_sfm::matching::{MatchOptions, PairOptions, candidate_pairs, match_pairs};
 use rayon::prelude::*;
 
 /// Maximum number of training photographs that are matched; if there are more, evenly spaced ones.
-const PHOTOGRAPHS: usize = 400;
+const MAX_PHOTOS: usize = 400;
 /// Minimum number of points: fewer say little about where surfaces are.
-const FEWEST: usize = 200;
+const MIN_POINTS: usize = 200;
 /// Maximum number of photographs whose features are also matched along epipolar lines. Held-out PSNR of the default run on 12 photographs
 /// with known poses, three seeds, without and with: fox 28.30, 28.70 dB; cup 24.36, 24.80; can 29.12, 28.96; plush bear 26.50, 26.78; plush
 /// toy 24.85, 25.16. With 24 photographs it gains no more than 0.1 dB.
-const GUIDED: usize = 25;
+const MAX_GUIDED_PHOTOS: usize = 25;
 
 /// Whether points should be found for `dataset`: it has none and was not rendered. In rendered datasets, empty space is known, and poses
 /// may be arbitrary.
-pub(crate) fn are_missing(dataset: &Dataset) -> bool {
+pub(crate) fn lacks_points(dataset: &Dataset) -> bool {
     dataset.points.as_ref().is_none_or(PointCloud::is_empty) && dataset.kind != "Blender"
 }
 
@@ -31,7 +31,7 @@ pub(crate) fn are_missing(dataset: &Dataset) -> bool {
 /// Returns their number, or `None` if there are too few, in which case the dataset is unchanged. `larger` has the same views with more
 /// pixels. Held-out photographs are not used.
 pub(crate) fn find_points(dataset: &mut Dataset, larger: Option<&Dataset>) -> Option<usize> {
-    let step = dataset.train.len().div_ceil(PHOTOGRAPHS).max(1);
+    let step = dataset.train.len().div_ceil(MAX_PHOTOS).max(1);
     let chosen: Vec<usize> = dataset.train.iter().copied().step_by(step).collect();
     let photos_of = &larger.unwrap_or(dataset).views;
     let is_pinhole = |view: &usize| photos_of[*view].camera.intrinsics.lens == Lens::Pinhole;
@@ -39,16 +39,16 @@ pub(crate) fn find_points(dataset: &mut Dataset, larger: Option<&Dataset>) -> Op
         return None;
     }
     let (side, most) = (Sift::default().max_side, max_features(None, chosen.len()));
-    let look = |view: &usize| Some((*view, Look::at(&photos_of[*view], side, most)?));
-    let looks: Vec<(usize, Look)> = chosen.par_iter().filter_map(look).collect();
+    let look = |view: &usize| Some((*view, ViewFeatures::extract(&photos_of[*view], side, most)?));
+    let extracted: Vec<(usize, ViewFeatures)> = chosen.par_iter().filter_map(look).collect();
     let (mut views, mut photos, mut features, mut colors) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
-    for (group, (view, look)) in looks.into_iter().enumerate() {
+    for (group, (view, look)) in extracted.into_iter().enumerate() {
         colors.push(look.colors);
         photos.push(PhotoInfo { group, ..look.info });
         features.push(look.features);
         views.push(view);
     }
-    let known = Known {
+    let known = KnownGeometry {
         poses: views
             .iter()
             .map(|view| Some(pose(&dataset.views[*view].camera)))
@@ -61,11 +61,11 @@ pub(crate) fn find_points(dataset: &mut Dataset, larger: Option<&Dataset>) -> Op
     let options = MapOptions::default();
     let mut found = extend(&photos, &features, &matches, &known, &options, &mut |_| ());
     let mut model = found.models.pop()?;
-    if photos.len() <= GUIDED {
+    if photos.len() <= MAX_GUIDED_PHOTOS {
         add_guided_points(&photos, &features, &found.pairs, &mut model, &options);
     }
     let points = model.points;
-    if points.len() < FEWEST {
+    if points.len() < MIN_POINTS {
         return None;
     }
     for (i, point) in (0u32..).zip(&points) {

@@ -1,7 +1,7 @@
 //! Finding of features and matches, which reuses those of an earlier call.
 
-use super::store::{self, Known, Looks, Settings};
-use super::{ENOUGH_POSED, PoseProgress};
+use super::feature_store::{self, PhotoFeatures, Settings, StoredFeatures};
+use super::{MIN_POSED_FRACTION, PoseProgress};
 use crate::RunError;
 use irradia_formats::{PhotoEntry, PhotoFolder, Pixels};
 use irradia_scene::resize_area;
@@ -18,24 +18,24 @@ use std::time::{Duration, Instant};
 /// Number of photographs per thread whose features are extracted between two checks of the time.
 const PHOTOS_PER_THREAD: usize = 32;
 /// Number of pairs that are matched between two checks of the time.
-const BATCH: usize = 1000;
+const PAIRS_PER_BATCH: usize = 1000;
 /// How often features and matches are saved while they are found.
-const SAVED_EVERY: Duration = Duration::from_secs(60);
+const SAVE_INTERVAL: Duration = Duration::from_secs(60);
 
 /// Files of features and matches: of the first attempt, of a second one, and of photographs in which what stands still is masked.
-const STORE: &str = "features.bin";
-const STORE_OF_MORE: &str = "features-more.bin";
-const STORE_OF_MASKED: &str = "features-masked.bin";
+const FEATURES_FILE: &str = "features.bin";
+const RETRY_FEATURES_FILE: &str = "features-more.bin";
+const MASKED_FEATURES_FILE: &str = "features-masked.bin";
 
 /// Numbers of photographs, and the maximum number of features if there are at most that many: a scene of few photographs has few points
 /// otherwise, and matching costs little. Splats that begin from these points end 0.7 dB better on lund_door, 12 photographs.
-const MANY_FEATURES: [(usize, usize); 2] = [(25, 8192), (35, 6144)];
+const MAX_FEATURES_BY_PHOTOS: [(usize, usize); 2] = [(25, 8192), (35, 6144)];
 
-/// Maximum number of features per photograph: the `wanted` one, or one that depends on the number of photographs.
-pub(super) fn max_features(wanted: Option<usize>, photos: usize) -> usize {
-    let many = MANY_FEATURES.into_iter().find(|(most, _)| photos <= *most);
+/// Maximum number of features per photograph: the `requested` one, or one that depends on the number of photographs.
+pub(super) fn max_features(requested: Option<usize>, photos: usize) -> usize {
+    let many = MAX_FEATURES_BY_PHOTOS.into_iter().find(|(most, _)| photos <= *most);
     let usual = many.map_or(Sift::default().max_features, |(_, features)| features);
-    wanted.unwrap_or(usual)
+    requested.unwrap_or(usual)
 }
 
 /// The photographs with the features and matches found so far.
@@ -46,7 +46,7 @@ pub(super) struct Work<'a> {
     path: Option<PathBuf>,
     settings: Settings,
     sift: Sift,
-    known: Known,
+    stored: StoredFeatures,
     /// Indices of the folder's photographs that could be decoded.
     used: Vec<usize>,
     /// Hashes of their files.
@@ -62,34 +62,34 @@ pub(super) struct Work<'a> {
 impl<'a> Work<'a> {
     /// Features and matches are kept in the folder `out`, if there is one.
     pub fn new(
-        wanted: Option<usize>,
+        requested: Option<usize>,
         out: Option<&Path>,
         folder: &'a PhotoFolder,
         progress: &'a (dyn Fn(PoseProgress) + Sync),
     ) -> Self {
         let sift = Sift {
-            max_features: max_features(wanted, folder.photos.len()),
+            max_features: max_features(requested, folder.photos.len()),
             ..Sift::default()
         };
-        Self::with(sift, out.map(|out| out.join(STORE)), folder, progress)
+        Self::open(sift, out.map(|out| out.join(FEATURES_FILE)), folder, progress)
     }
 
     /// The same photographs for a second attempt: with frontal descriptors, and with twice the features if at least half of the photographs
-    /// that were `left_out` have the maximum number. The number stays if it was `wanted`, or if some but at most a fifth of the photographs
+    /// that were `left_out` have the maximum number. The number stays if it was `requested`, or if some but at most a fifth of the photographs
     /// were left out, since twice as many features take four times as long to match.
-    pub fn again(&self, wanted: Option<usize>, left_out: &[usize], out: &Path) -> Self {
+    pub fn retry(&self, requested: Option<usize>, left_out: &[usize], out: &Path) -> Self {
         let most = self.sift.max_features;
         let full = left_out
             .iter()
             .filter(|photo| self.features[**photo].keypoints.len() >= most);
-        let few = !left_out.is_empty() && left_out.len() as f64 <= (1.0 - ENOUGH_POSED) * self.used.len() as f64;
-        let more = wanted.is_none() && !few && 2 * full.count() >= left_out.len();
+        let few = !left_out.is_empty() && left_out.len() as f64 <= (1.0 - MIN_POSED_FRACTION) * self.used.len() as f64;
+        let more = requested.is_none() && !few && 2 * full.count() >= left_out.len();
         let sift = Sift {
             max_features: if more { 2 * most } else { most },
             frontal: true,
             ..self.sift.clone()
         };
-        Self::with(sift, Some(out.join(STORE_OF_MORE)), self.folder, self.progress)
+        Self::open(sift, Some(out.join(RETRY_FEATURES_FILE)), self.folder, self.progress)
     }
 
     /// The same photographs with the masks of `folder`.
@@ -97,15 +97,15 @@ impl<'a> Work<'a> {
     where
         'a: 'b,
     {
-        Work::with(
+        Work::open(
             self.sift.clone(),
-            Some(out.join(STORE_OF_MASKED)),
+            Some(out.join(MASKED_FEATURES_FILE)),
             folder,
             self.progress,
         )
     }
 
-    fn with(
+    fn open(
         sift: Sift,
         path: Option<PathBuf>,
         folder: &'a PhotoFolder,
@@ -120,9 +120,9 @@ impl<'a> Work<'a> {
             ],
             frontal: sift.frontal,
         };
-        let (known, warning) = path
+        let (stored, warning) = path
             .as_ref()
-            .map(|path| store::read(path, settings))
+            .map(|path| feature_store::read(path, settings))
             .unwrap_or_default();
         let mut work = Self {
             folder,
@@ -130,7 +130,7 @@ impl<'a> Work<'a> {
             path,
             settings,
             sift,
-            known,
+            stored,
             used: Vec::new(),
             hashes: Vec::new(),
             features: Vec::new(),
@@ -192,28 +192,28 @@ impl<'a> Work<'a> {
         });
         let new: Vec<&PhotoEntry> = photos
             .iter()
-            .filter(|photo| !self.known.looks.contains_key(&photo.hash))
+            .filter(|photo| !self.stored.photos.contains_key(&photo.hash))
             .collect();
         let done = AtomicUsize::new(photos.len() - new.len());
         let mut failed: HashMap<u64, String> = HashMap::new();
         let mut saved = Instant::now();
-        for some in new.chunks(PHOTOS_PER_THREAD * rayon::current_num_threads()) {
-            let found: Vec<Result<Looks, String>> = some
+        for batch in new.chunks(PHOTOS_PER_THREAD * rayon::current_num_threads()) {
+            let found: Vec<Result<PhotoFeatures, String>> = batch
                 .par_iter()
                 .map(|photo| {
-                    let looks = extract(&self.sift, photo);
+                    let features = extract(&self.sift, photo);
                     let now = done.fetch_add(1, Ordering::Relaxed) + 1;
                     (self.progress)(PoseProgress::Done(now));
-                    looks
+                    features
                 })
                 .collect();
-            for (photo, looks) in some.iter().zip(found) {
-                match looks {
-                    Ok(looks) => self.known.looks.extend([(photo.hash, looks)]),
+            for (photo, features) in batch.iter().zip(found) {
+                match features {
+                    Ok(features) => self.stored.photos.extend([(photo.hash, features)]),
                     Err(reason) => failed.extend([(photo.hash, reason)]),
                 }
             }
-            if saved.elapsed() > SAVED_EVERY {
+            if saved.elapsed() > SAVE_INTERVAL {
                 self.save()?;
                 saved = Instant::now();
             }
@@ -222,16 +222,16 @@ impl<'a> Work<'a> {
             match failed.get(&photo.hash) {
                 None => {
                     // A photograph may be there twice.
-                    let comes_again = photos[i + 1..].iter().any(|other| other.hash == photo.hash);
-                    let looks = match comes_again {
-                        true => self.known.looks.get(&photo.hash).cloned(),
-                        false => self.known.looks.remove(&photo.hash),
+                    let is_repeated = photos[i + 1..].iter().any(|other| other.hash == photo.hash);
+                    let found = match is_repeated {
+                        true => self.stored.photos.get(&photo.hash).cloned(),
+                        false => self.stored.photos.remove(&photo.hash),
                     };
-                    let Looks {
+                    let PhotoFeatures {
                         features,
                         colors,
                         appearance,
-                    } = looks.unwrap_or_default();
+                    } = found.unwrap_or_default();
                     self.used.push(i);
                     self.hashes.push(photo.hash);
                     self.features.push(features);
@@ -242,9 +242,9 @@ impl<'a> Work<'a> {
             }
         }
         // Discards photographs that no longer exist.
-        self.known.looks = Default::default();
+        self.stored.photos = Default::default();
         let kept: HashSet<u64> = self.hashes.iter().copied().collect();
-        self.known
+        self.stored
             .matches
             .retain(|pair, _| pair.iter().all(|hash| kept.contains(hash)));
         if failed.len() < new.len() {
@@ -256,18 +256,23 @@ impl<'a> Work<'a> {
     fn save(&self) -> Result<(), RunError> {
         let Some(path) = &self.path else { return Ok(()) };
         let ordered = self.hashes.iter().zip(&self.features).zip(&self.colors);
-        let mut photos: Vec<store::Photo> = ordered
+        let mut photos: Vec<feature_store::Photo> = ordered
             .zip(&self.appearances)
             .map(|(((hash, features), colors), appearance)| (*hash, features, &colors[..], *appearance))
             .collect();
         // While features are extracted, all that are known are still here.
-        let mut known: Vec<_> = self.known.looks.iter().collect();
-        known.sort_unstable_by_key(|(hash, _)| **hash);
-        let known = known
+        let mut stored: Vec<_> = self.stored.photos.iter().collect();
+        stored.sort_unstable_by_key(|(hash, _)| **hash);
+        let stored = stored
             .into_iter()
-            .map(|(hash, looks)| (*hash, &looks.features, &looks.colors[..], looks.appearance));
-        photos.extend(known);
-        Ok(store::write(path, self.settings, &photos, &self.known.matches)?)
+            .map(|(hash, photo)| (*hash, &photo.features, &photo.colors[..], photo.appearance));
+        photos.extend(stored);
+        Ok(feature_store::write(
+            path,
+            self.settings,
+            &photos,
+            &self.stored.matches,
+        )?)
     }
 
     /// Matches the pairs that are worth matching.
@@ -281,7 +286,7 @@ impl<'a> Work<'a> {
         let hash = |pair: &[u32; 2]| pair.map(|i| self.hashes[i as usize]);
         let new: Vec<[u32; 2]> = pairs
             .iter()
-            .filter(|pair| !self.known.matches.contains_key(&hash(pair)))
+            .filter(|pair| !self.stored.matches.contains_key(&hash(pair)))
             .copied()
             .collect();
         (self.progress)(PoseProgress::Stage {
@@ -290,8 +295,8 @@ impl<'a> Work<'a> {
         });
         let done = AtomicUsize::new(0);
         let mut saved = Instant::now();
-        for some in new.chunks(BATCH) {
-            let found = match_pairs(&self.features, some, &matching, || {
+        for batch in new.chunks(PAIRS_PER_BATCH) {
+            let found = match_pairs(&self.features, batch, &matching, || {
                 let now = done.fetch_add(1, Ordering::Relaxed) + 1;
                 (self.progress)(PoseProgress::Done(now));
             });
@@ -300,9 +305,9 @@ impl<'a> Work<'a> {
                 .into_iter()
                 .map(|pair| (hash(&pair.photos), pair.matches))
                 .collect();
-            self.known.matches.extend(found);
+            self.stored.matches.extend(found);
             // If a long stage is interrupted, little is lost.
-            if saved.elapsed() > SAVED_EVERY {
+            if saved.elapsed() > SAVE_INTERVAL {
                 self.save()?;
                 saved = Instant::now();
             }
@@ -312,16 +317,16 @@ impl<'a> Work<'a> {
         }
         let matches = |photos: [u32; 2]| PairMatches {
             photos,
-            matches: self.known.matches[&photos.map(|i| self.hashes[i as usize])].clone(),
+            matches: self.stored.matches[&photos.map(|i| self.hashes[i as usize])].clone(),
         };
         Ok(pairs.into_iter().map(matches).collect())
     }
 }
 
 /// Extracts the features of a photograph, in pixels at full size, with their colours and the photograph's pixel statistics.
-fn extract(sift: &Sift, photo: &PhotoEntry) -> Result<Looks, String> {
+fn extract(sift: &Sift, photo: &PhotoEntry) -> Result<PhotoFeatures, String> {
     let pixels = photo.read(sift.max_side).map_err(|error| error.to_string())?;
-    let grey = in_grey(&pixels.data, pixels.channels);
+    let grey = to_grey(&pixels.data, pixels.channels);
     let mask = mask_of(photo, &pixels)?;
     let features = sift.extract(&GreyPhoto {
         width: pixels.width,
@@ -332,13 +337,13 @@ fn extract(sift: &Sift, photo: &PhotoEntry) -> Result<Looks, String> {
     let size = [pixels.width, pixels.height];
     let color = |x, y| color_at(&pixels.data, size, pixels.channels, x, y);
     let colors = features.keypoints.iter().map(|k| color(k.x, k.y)).collect();
-    let enlarge = [
+    let scale = [
         photo.width as f32 / pixels.width as f32,
         photo.height as f32 / pixels.height as f32,
     ];
     let (width, height) = (pixels.width as usize, pixels.height as usize);
-    Ok(Looks {
-        features: features.scaled(enlarge),
+    Ok(PhotoFeatures {
+        features: features.scaled(scale),
         colors,
         appearance: Appearance::measure(width, height, &grey, mask.as_deref()),
     })
@@ -350,11 +355,11 @@ fn mask_of(photo: &PhotoEntry, pixels: &Pixels) -> Result<Option<Vec<u8>>, Strin
         .read_mask(pixels.width, pixels.height)
         .map_err(|error| error.to_string())?;
     let alpha = (pixels.channels == 4).then(|| pixels.data.chunks_exact(4).map(|pixel| pixel[3]).collect());
-    Ok(both(given, alpha))
+    Ok(combine_masks(given, alpha))
 }
 
 /// Combines a mask and an alpha channel: a pixel is kept if neither hides it.
-pub(super) fn both(mask: Option<Vec<u8>>, alpha: Option<Vec<u8>>) -> Option<Vec<u8>> {
+pub(super) fn combine_masks(mask: Option<Vec<u8>>, alpha: Option<Vec<u8>>) -> Option<Vec<u8>> {
     match (mask, alpha) {
         (Some(mask), Some(alpha)) => Some(mask.into_iter().zip(alpha).map(|(a, b)| a.min(b)).collect()),
         (mask, alpha) => mask.or(alpha),
@@ -362,7 +367,7 @@ pub(super) fn both(mask: Option<Vec<u8>>, alpha: Option<Vec<u8>>) -> Option<Vec<
 }
 
 /// `[to[1], to[0], 3]` the pixels reduced to the size `to`.
-pub(super) fn in_rgb(pixels: &Pixels, to: [u32; 2]) -> Vec<u8> {
+pub(super) fn to_rgb(pixels: &Pixels, to: [u32; 2]) -> Vec<u8> {
     let reduced = resize_area(&pixels.data, pixels.channels, [pixels.width, pixels.height], to);
     let channels = pixels.channels as usize;
     let rgb = reduced
@@ -372,7 +377,7 @@ pub(super) fn in_rgb(pixels: &Pixels, to: [u32; 2]) -> Vec<u8> {
 }
 
 /// `[H, W]` the brightness of `[H, W, channels]`.
-pub(super) fn in_grey(data: &[u8], channels: u32) -> Vec<u8> {
+pub(super) fn to_grey(data: &[u8], channels: u32) -> Vec<u8> {
     data.chunks_exact(channels as usize).map(luma).collect()
 }
 
@@ -400,9 +405,11 @@ mod tests {
         let folder = PhotoFolder::default();
         let progress = |_: PoseProgress| ();
         let mut work = Work::new(None, Some(out.path()), &folder, &progress);
-        work.known.looks.extend([7, 3].map(|hash| (hash, Looks::default())));
+        work.stored
+            .photos
+            .extend([7, 3].map(|hash| (hash, PhotoFeatures::default())));
         work.save().unwrap();
         let again = Work::new(None, Some(out.path()), &folder, &progress);
-        assert_eq!(again.known, work.known);
+        assert_eq!(again.stored, work.stored);
     }
 }

@@ -3,44 +3,44 @@
 
 use super::PoseProgress;
 use super::attempt::{Attempt, Matched};
-use super::brought::{MASKS, put_away};
-use super::stages::in_rgb;
+use super::import::{MASKS_FOLDER, move_to_unused};
+use super::stages::to_rgb;
 use crate::RunError;
 use crate::scene_file::same_file;
 use irradia_formats::{PhotoEntry, PhotoFolder, write_png};
-use irradia_sfm::map::{StandsStill, stands_still, turntable};
-use irradia_sfm::{Backdrop, Overlay, StillScene, bars};
+use irradia_sfm::map::{StillRegion, find_still_region, turntable_rings};
+use irradia_sfm::{Backdrop, OverlayDetector, StillScene, bars};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
 /// File in the folder of masks that marks them as written by an earlier call.
-const RECORD: &str = ".irradia";
+const RECORD_FILE: &str = ".irradia";
 /// Longer side of the reduced photographs in which masks are found, px.
-const SIDE: u32 = 480;
+const MASK_SIDE: u32 = 480;
 /// Minimum number of photographs of one camera to determine a still background.
-const LEAST: usize = 4;
+const MIN_CAMERA_PHOTOS: usize = 4;
 /// A photograph shows a still background if it shows at least this fraction of the mean share that photographs show of it.
-const SHOWS: f64 = 0.5;
+const MIN_SHOWN_FRACTION: f64 = 0.5;
 /// Minimum fraction of the pixels that moves: photographs from one place are not of a turntable.
-const MOVES: f64 = 0.03;
+const MIN_MOVING_FRACTION: f64 = 0.03;
 /// A backdrop surrounds what turns: it takes at least this fraction of the border of half of the photographs. A camera that flies an exact
 /// circle, such as a drone's, has plain sky in the upper half at most.
-const SURROUNDS: f64 = 0.55;
+const MIN_BORDER_FRACTION: f64 = 0.55;
 /// Minimum fraction of the photographs' pixels that a backdrop takes: if masks keep less than half, training leaves no splats outside of
 /// what they keep. A medal in front of a dark backdrop, 29 % of which can be masked, gains nothing from masks.
-const COVERS: f64 = 0.5;
+const MIN_BACKDROP_FRACTION: f64 = 0.5;
 /// Number of rings, the largest ones, whose backdrops each photograph is compared with; limits the time.
-const RINGS: usize = 8;
+const MAX_RINGS: usize = 8;
 /// Number of photographs of each camera that are examined for bars and text.
-const EXAMINED: usize = 24;
+const EXAMINED_PHOTOS: usize = 24;
 /// Maximum fraction of the pixels that overlaid text covers. A larger still part may be behind the scene, such as the background of a
 /// turntable, and hidden by the scene in some photographs: 7 % of a tankard that fills 86 % of its photographs would be masked with it.
-const LIES_OVER: f64 = 0.06;
+const MAX_OVERLAY_FRACTION: f64 = 0.06;
 /// Minimum range of a backdrop's colour in half of the photographs, of 255: a backdrop of a single colour looks the same from everywhere
 /// and does no harm.
-const RANGE: f64 = 8.0;
+const MIN_COLOR_RANGE: f64 = 8.0;
 
 /// Reduced photographs, `[H, W, 3]`, by index of the photograph.
 type Pictures = BTreeMap<usize, Vec<u8>>;
@@ -49,31 +49,31 @@ type Pictures = BTreeMap<usize, Vec<u8>>;
 pub(super) struct Masked {
     /// The photographs with their masks.
     pub folder: PhotoFolder,
-    pub still: StandsStill,
+    pub still: StillRegion,
     /// Message for the user.
-    pub told: String,
+    pub message: String,
 }
 
 /// A still background behind some photographs.
-struct Behind {
+struct StillBackground {
     scene: StillScene,
     /// Minimum fraction of a photograph that shows it.
     least: f64,
 }
 
-impl Behind {
+impl StillBackground {
     /// The background behind those of `pictures` that are in `group`, if there are enough.
     fn of(group: &[usize], [width, height]: [u32; 2], pictures: &Pictures) -> Option<Self> {
         let of: Vec<&Vec<u8>> = group.iter().filter_map(|photo| pictures.get(photo)).collect();
-        (of.len() >= LEAST).then(|| {
-            let scene = StillScene::of(width as usize, height as usize, &of);
+        (of.len() >= MIN_CAMERA_PHOTOS).then(|| {
+            let scene = StillScene::from_pictures(width as usize, height as usize, &of);
             let share: f64 = of
                 .par_iter()
-                .map(|picture| scene.shown(picture).share())
+                .map(|picture| scene.segment(picture).still_fraction())
                 .collect::<Vec<_>>()
                 .iter()
                 .sum();
-            let least = SHOWS * share / of.len() as f64;
+            let least = MIN_SHOWN_FRACTION * share / of.len() as f64;
             Self { scene, least }
         })
     }
@@ -92,17 +92,17 @@ pub(super) fn mask(
     out: &Path,
     progress: &(dyn Fn(PoseProgress) + Sync),
 ) -> Result<Option<Masked>, RunError> {
-    if !is_free_once_cleared(folder, out)? {
+    if !clear_own_masks(folder, out)? {
         return Ok(None);
     }
-    let Some(still) = stands_still(&matched.infos, matched.work.features(), &matched.pairs) else {
+    let Some(still) = find_still_region(&matched.infos, matched.work.features(), &matched.pairs) else {
         return Ok(None);
     };
-    let masks = find(matched, folder, &still)?;
+    let masks = find_still_masks(matched, folder, &still)?;
     if masks.is_empty() {
         return Ok(None);
     }
-    let (written, told) = write_and_tell(
+    let (written, message) = write_and_report(
         out,
         folder,
         &masks,
@@ -117,7 +117,7 @@ pub(super) fn mask(
             ..folder.clone()
         },
         still,
-        told,
+        message,
     }))
 }
 
@@ -129,42 +129,46 @@ pub(super) fn mask_backdrop(
     out: &Path,
     progress: &(dyn Fn(PoseProgress) + Sync),
 ) -> Result<Option<String>, RunError> {
-    let rings = attempt.reconstruction.models.first().map_or(Vec::new(), turntable);
-    if rings.is_empty() || !is_free_once_cleared(folder, out)? {
+    let rings = attempt
+        .reconstruction
+        .models
+        .first()
+        .map_or(Vec::new(), turntable_rings);
+    if rings.is_empty() || !clear_own_masks(folder, out)? {
         return Ok(None);
     }
-    let masks = behind_turntable(&attempt.matched, folder, &rings)?;
+    let masks = turntable_masks(&attempt.matched, folder, &rings)?;
     if masks.is_empty() {
         return Ok(None);
     }
-    let (_, told) = write_and_tell(out, folder, &masks, "are the backdrop of a turntable", progress)?;
-    Ok(Some(told))
+    let (_, message) = write_and_report(out, folder, &masks, "are the backdrop of a turntable", progress)?;
+    Ok(Some(message))
 }
 
 /// Writes masks of bars around the photographs and of overlaid text into `out` if there are any and no photograph has a mask of its own;
 /// returns the message for the user. The poses do not need these masks, since bars have no features and text few, but training would place
 /// splats directly in front of the cameras to reproduce them.
-pub(super) fn mask_edited(
+pub(super) fn mask_bars_and_text(
     attempt: &Attempt,
     folder: &PhotoFolder,
     out: &Path,
     progress: &(dyn Fn(PoseProgress) + Sync),
 ) -> Result<Option<String>, RunError> {
-    if !is_free_once_cleared(folder, out)? {
+    if !clear_own_masks(folder, out)? {
         return Ok(None);
     }
     let mut masks = BTreeMap::new();
-    for photos in cameras(&attempt.matched) {
+    for photos in photos_by_camera(&attempt.matched) {
         let some = photos
             .iter()
             .copied()
-            .step_by(photos.len().div_ceil(EXAMINED))
+            .step_by(photos.len().div_ceil(EXAMINED_PHOTOS))
             .collect::<Vec<_>>();
-        if some.len() < LEAST {
+        if some.len() < MIN_CAMERA_PHOTOS {
             continue;
         }
         let (size, pictures) = pictures(&attempt.matched, folder, &some)?;
-        let Some(still) = bars_in(size, &pictures).or_else(|| writing_over(size, &pictures)) else {
+        let Some(still) = bar_mask(size, &pictures).or_else(|| overlay_mask(size, &pictures)) else {
             continue;
         };
         for photo in photos {
@@ -175,18 +179,18 @@ pub(super) fn mask_edited(
     if masks.is_empty() {
         return Ok(None);
     }
-    let (_, told) = write_and_tell(
+    let (_, message) = write_and_report(
         out,
         folder,
         &masks,
         "are bars around the image or text laid over it",
         progress,
     )?;
-    Ok(Some(told))
+    Ok(Some(message))
 }
 
 /// The pixels of bars around `pictures`, the same in all; `None` if there are no bars.
-fn bars_in(size: [u32; 2], pictures: &Pictures) -> Option<Vec<bool>> {
+fn bar_mask(size: [u32; 2], pictures: &Pictures) -> Option<Vec<bool>> {
     let [width, height] = size.map(|side| side as usize);
     let bars = bars(width, height, &pictures.values().collect::<Vec<_>>());
     // Lines at the edge of a bar are a mixture of bar and photograph.
@@ -199,22 +203,22 @@ fn bars_in(size: [u32; 2], pictures: &Pictures) -> Option<Vec<bool>> {
 }
 
 /// Candidates for what is overlaid on all of `pictures`.
-fn overlay([width, height]: [u32; 2], pictures: &Pictures) -> Overlay<'_> {
-    Overlay::of(width as usize, height as usize, &pictures.values().collect::<Vec<_>>())
+fn overlay([width, height]: [u32; 2], pictures: &Pictures) -> OverlayDetector<'_> {
+    OverlayDetector::new(width as usize, height as usize, &pictures.values().collect::<Vec<_>>())
 }
 
 /// The pixels of what is overlaid on `pictures`, if it is certain and small.
-fn writing_over(size: [u32; 2], pictures: &Pictures) -> Option<Vec<bool>> {
+fn overlay_mask(size: [u32; 2], pictures: &Pictures) -> Option<Vec<bool>> {
     let overlay = overlay(size, pictures);
-    let lies = overlay.is_sure().then(|| overlay.pixels())?;
-    (share(&lies) as f64 <= LIES_OVER * lies.len() as f64).then_some(lies)
+    let overlaid = overlay.is_certain().then(|| overlay.mask())?;
+    (still_pixels(&overlaid) as f64 <= MAX_OVERLAY_FRACTION * overlaid.len() as f64).then_some(overlaid)
 }
 
 /// Removes from `photos` the masks that an earlier call wrote into `out`, which is also the folder of the photographs: they are not the
 /// user's.
-pub(super) fn ignore_own(photos: &mut [PhotoEntry], out: &Path) -> Result<(), RunError> {
-    let written = out.join(MASKS);
-    if !written.join(RECORD).exists() {
+pub(super) fn ignore_own_masks(photos: &mut [PhotoEntry], out: &Path) -> Result<(), RunError> {
+    let written = out.join(MASKS_FOLDER);
+    if !written.join(RECORD_FILE).exists() {
         return Ok(());
     }
     for photo in photos {
@@ -226,25 +230,25 @@ pub(super) fn ignore_own(photos: &mut [PhotoEntry], out: &Path) -> Result<(), Ru
     Ok(())
 }
 
-/// Puts away the masks of an earlier call, which the user may have edited; returns whether there are no other masks.
-fn is_free_once_cleared(folder: &PhotoFolder, out: &Path) -> Result<bool, RunError> {
-    let written = out.join(MASKS);
-    let record = written.join(RECORD);
+/// Moves the masks of an earlier call to `unused`, which the user may have edited; returns whether there are no other masks.
+fn clear_own_masks(folder: &PhotoFolder, out: &Path) -> Result<bool, RunError> {
+    let written = out.join(MASKS_FOLDER);
+    let record = written.join(RECORD_FILE);
     if record.exists() {
         let entries = fs::read_dir(&written).map_err(RunError::io("read", &written))?;
         let names: Vec<String> = (entries.flatten())
             .map(|entry| entry.file_name().to_string_lossy().into_owned())
-            .filter(|name| name != RECORD)
+            .filter(|name| name != RECORD_FILE)
             .collect();
         fs::remove_file(&record).map_err(RunError::io("remove", &record))?;
-        put_away(out, names.into_iter().map(|name| format!("{MASKS}/{name}")))?;
+        move_to_unused(out, names.into_iter().map(|name| format!("{MASKS_FOLDER}/{name}")))?;
     }
     // Any remaining masks are the user's, for the poses or for the training alone.
     Ok(!written.exists() && folder.photos.iter().all(|photo| photo.mask.is_none()))
 }
 
 /// Writes masks and tells the user of `what` they are; returns their folder and that message.
-fn write_and_tell(
+fn write_and_report(
     out: &Path,
     folder: &PhotoFolder,
     masks: &BTreeMap<usize, Mask>,
@@ -252,28 +256,32 @@ fn write_and_tell(
     progress: &(dyn Fn(PoseProgress) + Sync),
 ) -> Result<(PathBuf, String), RunError> {
     let written = write(out, folder, masks)?;
-    let masked: usize = (masks.values()).map(|mask| share(&mask.still)).sum();
+    let masked: usize = (masks.values()).map(|mask| still_pixels(&mask.still)).sum();
     let of: usize = masks.values().map(|mask| mask.still.len()).sum();
-    let told = format!(
+    let message = format!(
         "{:.0} % of the pixels of {} photographs {what}: masked in {}; to change this, put masks of your own into a folder named masks \
          beside the photographs",
         100.0 * masked as f64 / of as f64,
         masks.len(),
         written.display()
     );
-    progress(PoseProgress::Warned(told.clone()));
-    Ok((written, told))
+    progress(PoseProgress::Warned(message.clone()));
+    Ok((written, message))
 }
 
 /// Masks by index of the folder's photographs.
-fn find(matched: &Matched, folder: &PhotoFolder, still: &StandsStill) -> Result<BTreeMap<usize, Mask>, RunError> {
+fn find_still_masks(
+    matched: &Matched,
+    folder: &PhotoFolder,
+    still: &StillRegion,
+) -> Result<BTreeMap<usize, Mask>, RunError> {
     let groups = still.groups(matched.infos.len());
-    of_cameras(matched, folder, |size, pictures| {
-        let scenes: Vec<Behind> = groups
+    masks_by_camera(matched, folder, |size, pictures| {
+        let scenes: Vec<StillBackground> = groups
             .iter()
-            .filter_map(|group| Behind::of(group, size, pictures))
+            .filter_map(|group| StillBackground::of(group, size, pictures))
             .collect();
-        let mut masks = shown(&scenes, pictures);
+        let mut masks = background_masks(&scenes, pictures);
         add_overlay(size, pictures, &mut masks);
         masks
     })
@@ -281,38 +289,40 @@ fn find(matched: &Matched, folder: &PhotoFolder, still: &StandsStill) -> Result<
 
 /// Adds what is overlaid on all of `pictures` to the mask of each: unlike a background, it is hidden in none of them.
 fn add_overlay(size: [u32; 2], pictures: &Pictures, masks: &mut BTreeMap<usize, Vec<bool>>) {
-    let mut lies = overlay(size, pictures).pixels();
-    for (at, lies) in lies.iter_mut().enumerate() {
+    let mut overlaid = overlay(size, pictures).mask();
+    for (at, overlaid) in overlaid.iter_mut().enumerate() {
         let still = masks.values().filter(|mask| mask[at]).count();
-        *lies |= still > 0 && 2 * still >= masks.len();
+        *overlaid |= still > 0 && 2 * still >= masks.len();
     }
-    let covers = share(&lies) as f64 / lies.len() as f64;
-    if covers > 0.0 && covers <= LIES_OVER {
+    let covers = still_pixels(&overlaid) as f64 / overlaid.len() as f64;
+    if covers > 0.0 && covers <= MAX_OVERLAY_FRACTION {
         for photo in pictures.keys() {
-            let mask = masks.entry(*photo).or_insert_with(|| vec![false; lies.len()]);
-            mask.iter_mut().zip(&lies).for_each(|(still, lies)| *still |= *lies);
+            let mask = masks.entry(*photo).or_insert_with(|| vec![false; overlaid.len()]);
+            mask.iter_mut()
+                .zip(&overlaid)
+                .for_each(|(still, overlaid)| *still |= *overlaid);
         }
     }
 }
 
-/// Like [`find`], for a plain backdrop behind what turns in `rings`.
-fn behind_turntable(
+/// Like [`find_still_masks`], for a plain backdrop behind what turns in `rings`.
+fn turntable_masks(
     matched: &Matched,
     folder: &PhotoFolder,
     rings: &[Vec<usize>],
 ) -> Result<BTreeMap<usize, Mask>, RunError> {
-    of_cameras(matched, folder, |[width, height], pictures| {
+    masks_by_camera(matched, folder, |[width, height], pictures| {
         // A photograph in different light, such as with the shadow of what turns, may match the backdrop of another ring better.
         let backdrops: Vec<Backdrop> = rings
             .iter()
-            .take(RINGS)
+            .take(MAX_RINGS)
             .map(|ring| ring.iter().filter_map(|photo| pictures.get(photo)).collect::<Vec<_>>())
-            .filter(|of| of.len() >= LEAST)
-            .map(|of| Backdrop::of(width as usize, height as usize, &of))
+            .filter(|of| of.len() >= MIN_CAMERA_PHOTOS)
+            .map(|of| Backdrop::from_pictures(width as usize, height as usize, &of))
             .collect();
         let most = |picture: &[u8]| {
-            let all = backdrops.iter().map(|backdrop| (backdrop, backdrop.shown(picture)));
-            all.max_by_key(|(_, shown)| share(shown))
+            let all = backdrops.iter().map(|backdrop| (backdrop, backdrop.mask(picture)));
+            all.max_by_key(|(_, shown)| still_pixels(shown))
         };
         let masks: Vec<_> = pictures
             .par_iter()
@@ -322,30 +332,30 @@ fn behind_turntable(
             let enough = masks.iter().filter(|(_, of, shown)| value(of, shown) >= least).count();
             2 * enough > masks.len()
         };
-        let is_one = half_have(&|of, shown| of.surrounds(shown), SURROUNDS)
-            && half_have(&|of, shown| f64::from(of.range(shown)), RANGE);
-        let mean = masks.iter().map(|mask| share(&mask.2)).sum::<usize>() as f64 / masks.len().max(1) as f64;
-        let covers = mean > COVERS * f64::from(width * height);
+        let is_backdrop = half_have(&|of, shown| of.border_fraction(shown), MIN_BORDER_FRACTION)
+            && half_have(&|of, shown| f64::from(of.color_range(shown)), MIN_COLOR_RANGE);
+        let mean = masks.iter().map(|mask| still_pixels(&mask.2)).sum::<usize>() as f64 / masks.len().max(1) as f64;
+        let covers = mean > MIN_BACKDROP_FRACTION * f64::from(width * height);
         let kept = masks
             .into_iter()
-            .filter(|mask| is_one && covers && share(&mask.2) as f64 >= SHOWS * mean);
+            .filter(|mask| is_backdrop && covers && still_pixels(&mask.2) as f64 >= MIN_SHOWN_FRACTION * mean);
         kept.map(|(photo, _, shown)| (photo, shown)).collect()
     })
 }
 
 /// Number of pixels of a mask where something stands still.
-fn share(mask: &[bool]) -> usize {
+fn still_pixels(mask: &[bool]) -> usize {
     mask.iter().filter(|still| **still).count()
 }
 
 /// Masks by index of the folder's photographs; `of` finds them in the reduced photographs, `[H, W, 3]`, of each camera.
-fn of_cameras(
+fn masks_by_camera(
     matched: &Matched,
     folder: &PhotoFolder,
     of: impl Fn([u32; 2], &Pictures) -> BTreeMap<usize, Vec<bool>>,
 ) -> Result<BTreeMap<usize, Mask>, RunError> {
     let mut masks = BTreeMap::new();
-    for photos in cameras(matched) {
+    for photos in photos_by_camera(matched) {
         let (size, pictures) = pictures(matched, folder, &photos)?;
         for (photo, still) in of(size, &pictures) {
             masks.insert(matched.work.photos()[photo], Mask { size, still });
@@ -355,7 +365,7 @@ fn of_cameras(
 }
 
 /// The photographs of each camera.
-fn cameras(matched: &Matched) -> Vec<Vec<usize>> {
+fn photos_by_camera(matched: &Matched) -> Vec<Vec<usize>> {
     let mut cameras: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
     for (photo, info) in matched.infos.iter().enumerate() {
         cameras.entry(info.group).or_default().push(photo);
@@ -366,21 +376,21 @@ fn cameras(matched: &Matched) -> Vec<Vec<usize>> {
 /// Reduced copies of `photos`, which are by one camera, and their size.
 fn pictures(matched: &Matched, folder: &PhotoFolder, photos: &[usize]) -> Result<([u32; 2], Pictures), RunError> {
     let entry = |photo: usize| &folder.photos[matched.work.photos()[photo]];
-    let size = small(entry(photos[0]));
+    let size = reduced_size(entry(photos[0]));
     let pictures = photos
         .par_iter()
-        .map(|photo| Ok((*photo, in_rgb(&entry(*photo).read(SIDE)?, size))))
+        .map(|photo| Ok((*photo, to_rgb(&entry(*photo).read(MASK_SIDE)?, size))))
         .collect::<Result<_, RunError>>()?;
     Ok((size, pictures))
 }
 
 /// The pixels at which `pictures` show a background, by photograph. Of several `scenes`, such as those of rings at different heights, each
 /// photograph gets the one of which it shows most.
-fn shown(scenes: &[Behind], pictures: &Pictures) -> BTreeMap<usize, Vec<bool>> {
+fn background_masks(scenes: &[StillBackground], pictures: &Pictures) -> BTreeMap<usize, Vec<bool>> {
     let most = |picture: &[u8]| {
-        let all = scenes.iter().enumerate().map(|(i, behind)| {
-            let shown = behind.scene.shown(picture);
-            (i, shown.share(), shown)
+        let all = scenes.iter().enumerate().map(|(i, background)| {
+            let shown = background.scene.segment(picture);
+            (i, shown.still_fraction(), shown)
         });
         let shown = all.filter(|(i, share, _)| *share >= scenes[*i].least);
         shown.max_by(|a, b| a.1.total_cmp(&b.1))
@@ -395,15 +405,15 @@ fn shown(scenes: &[Behind], pictures: &Pictures) -> BTreeMap<usize, Vec<bool>> {
     }
     let moves = |masks: &BTreeMap<usize, Vec<bool>>| {
         let pixels = || masks.values().flatten();
-        pixels().filter(|still| !**still).count() as f64 >= MOVES * pixels().count() as f64
+        pixels().filter(|still| !**still).count() as f64 >= MIN_MOVING_FRACTION * pixels().count() as f64
     };
     by_scene.into_values().filter(moves).flatten().collect()
 }
 
 /// The reduced size at which the mask of `photo` is found, the same for all photographs of its camera.
-fn small(photo: &PhotoEntry) -> [u32; 2] {
+fn reduced_size(photo: &PhotoEntry) -> [u32; 2] {
     let size = [photo.width, photo.height];
-    let scale = (f64::from(SIDE) / f64::from(photo.width.max(photo.height))).min(1.0);
+    let scale = (f64::from(MASK_SIDE) / f64::from(photo.width.max(photo.height))).min(1.0);
     size.map(|side| ((scale * f64::from(side)).round() as u32).max(1))
 }
 
@@ -413,13 +423,13 @@ fn file_name(photo: &PhotoEntry) -> String {
 
 /// Writes one mask per photograph, at its size, into a subfolder of `out`: white where nothing is known to stand still.
 fn write(out: &Path, of: &PhotoFolder, masks: &BTreeMap<usize, Mask>) -> Result<PathBuf, RunError> {
-    let folder = out.join(MASKS);
+    let folder = out.join(MASKS_FOLDER);
     let new = folder.with_extension("new");
     if new.exists() {
         fs::remove_dir_all(&new).map_err(RunError::io("clear", &new))?;
     }
     fs::create_dir_all(&new).map_err(RunError::io("create", &new))?;
-    let record = new.join(RECORD);
+    let record = new.join(RECORD_FILE);
     fs::write(&record, b"").map_err(RunError::io("write", &record))?;
     of.photos.par_iter().enumerate().try_for_each(|(i, photo)| {
         let size = [photo.width, photo.height];

@@ -201,6 +201,11 @@ fn a_training_begins_with_the_splats_of_a_scene() {
     let mut run = Run::begin_on(from.clone().check().expect("a request"), dataset()).expect("a run");
     let splats = run.trainer().engine.state().splats.clone();
     assert_eq!(splats.len(), first.splats as usize);
+    let shown = run.trainer().render_options(0).sh_degree;
+    assert_eq!(
+        shown, 3,
+        "colours that depend on the direction do so from the first step on"
+    );
     run.train(&mut []).expect("trains");
     let second = run.finish().expect("finishes").report;
     assert!(second.psnr > first.psnr - 1.0, "{} after {}", second.psnr, first.psnr);

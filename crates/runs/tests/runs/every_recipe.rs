@@ -7,7 +7,7 @@ use irradia_runs::train::recipe::BUILT_IN;
 use std::path::Path;
 use std::sync::Arc;
 
-const SIDE: u32 = 120;
+const MAX_SIDE: u32 = 120;
 const STEPS: u64 = 30;
 /// Held-out views per run: enough to see that evaluation works.
 const HELD_OUT: usize = 2;
@@ -15,7 +15,7 @@ const HELD_OUT: usize = 2;
 /// The dataset at `path` with its photographs decoded; `None` if the folder contains no posed photographs.
 fn in_memory(path: &Path) -> Option<Dataset> {
     let options = DatasetOptions {
-        max_side: Some(SIDE),
+        max_side: Some(MAX_SIDE),
         ..DatasetOptions::default()
     };
     let mut dataset = read_dataset(path, &options).ok()?;

@@ -4,11 +4,11 @@ use super::*;
 use irradia_compute::gpu::{Gpu, Wanted};
 use irradia_compute::{Device, DeviceChoice};
 
-fn is_there() -> bool {
+fn has_gpu() -> bool {
     irradia_testkit::gpu_or_skip(|| Gpu::open(&Wanted::Any)).is_some()
 }
 
-fn on(device: &str, folder: &Path, recipe: &str, steps: u64) -> Run {
+fn begin_on_device(device: &str, folder: &Path, recipe: &str, steps: u64) -> Run {
     let request = TrainInput {
         device: device.to_owned(),
         recipe: recipe.to_owned(),
@@ -19,13 +19,13 @@ fn on(device: &str, folder: &Path, recipe: &str, steps: u64) -> Run {
 
 #[test]
 fn a_run_on_the_gpu_ends_as_on_the_cpu() {
-    if !is_there() {
+    if !has_gpu() {
         return;
     }
     let folder = folder();
     for recipe in ["fast", "classic", "mcmc", "curriculum"] {
         let psnr = ["cpu", "gpu"].map(|device| {
-            let mut run = on(device, folder.path(), recipe, 30);
+            let mut run = begin_on_device(device, folder.path(), recipe, 30);
             run.train(&mut []).expect("trains");
             let report = run.finish().expect("finishes").report;
             // The smoothness and coarse losses of `curriculum` are computed on the CPU, and the report says so.
@@ -45,7 +45,7 @@ fn a_run_on_the_gpu_ends_as_on_the_cpu() {
 
 #[test]
 fn a_hash_grid_on_the_gpu_ends_as_on_the_cpu() {
-    if !is_there() {
+    if !has_gpu() {
         return;
     }
     let folder = folder();
@@ -70,7 +70,7 @@ fn a_hash_grid_on_the_gpu_ends_as_on_the_cpu() {
 
 #[test]
 fn a_run_moves_between_devices_and_names_its_own() {
-    if !is_there() {
+    if !has_gpu() {
         return;
     }
     struct StopAt(u64, Vec<String>);
@@ -87,7 +87,7 @@ fn a_run_moves_between_devices_and_names_its_own() {
         }
     }
     let folder = folder();
-    let mut run = on("gpu", folder.path(), "classic", 20);
+    let mut run = begin_on_device("gpu", folder.path(), "classic", 20);
     let mut observer = StopAt(10, Vec::new());
     run.train(&mut [&mut observer]).expect("trains");
     assert!(
@@ -103,7 +103,7 @@ fn a_run_moves_between_devices_and_names_its_own() {
     assert_eq!(run.trainer().clock.step, 10);
     run.train(&mut []).expect("trains");
     let moved = run.finish().expect("finishes").report.psnr;
-    let mut whole = on("cpu", folder.path(), "classic", 20);
+    let mut whole = begin_on_device("cpu", folder.path(), "classic", 20);
     whole.train(&mut []).expect("trains");
     let expected = whole.finish().expect("finishes").report.psnr;
     assert!((moved - expected).abs() < 0.1, "{moved} {expected}");
@@ -111,7 +111,7 @@ fn a_run_moves_between_devices_and_names_its_own() {
 
 #[test]
 fn a_lost_gpu_ends_the_run_with_a_line_and_leaves_its_checkpoint() {
-    if !is_there() {
+    if !has_gpu() {
         return;
     }
     struct LoseAt(u64);
@@ -131,7 +131,7 @@ fn a_lost_gpu_ends_the_run_with_a_line_and_leaves_its_checkpoint() {
         }
     }
     let folder = folder();
-    let mut run = on("gpu", folder.path(), "classic", 20);
+    let mut run = begin_on_device("gpu", folder.path(), "classic", 20);
     let error = run
         .train(&mut [&mut LoseAt(8)])
         .expect_err("the GPU is lost")
@@ -168,7 +168,7 @@ fn a_gpu_that_is_not_there_is_a_mistake_of_the_request() {
 
 #[test]
 fn pictures_of_the_gpu_are_those_of_the_cpu() {
-    if !is_there() {
+    if !has_gpu() {
         return;
     }
     let folder = folder();

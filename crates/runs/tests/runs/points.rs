@@ -21,7 +21,7 @@ fn without_points() -> Dataset {
 }
 
 /// Maximum relative depth error of a sound point; the scene has a mirror, whose points are behind it.
-const SOUND: f32 = 0.05;
+const MAX_DEPTH_ERROR: f32 = 0.05;
 
 /// `[points seen]` the relative depth error of each point in each view that is recorded as showing it.
 fn errors_of_depth(dataset: &Dataset, points: &PointCloud) -> Vec<f32> {
@@ -43,9 +43,9 @@ fn errors_of_depth(dataset: &Dataset, points: &PointCloud) -> Vec<f32> {
 }
 
 /// A run after its first two steps, and its messages about points.
-fn begun(input: TrainInput, dataset: Dataset) -> (Run, Vec<String>) {
-    struct Told(Vec<String>);
-    impl Observer for Told {
+fn begin_and_step(input: TrainInput, dataset: Dataset) -> (Run, Vec<String>) {
+    struct PointMessages(Vec<String>);
+    impl Observer for PointMessages {
         fn on_event(&mut self, event: &Event, _trainer: &Trainer) -> Signal {
             if let Event::Decided { message } = event {
                 self.0.extend(message.contains("no points").then(|| message.clone()));
@@ -57,22 +57,22 @@ fn begun(input: TrainInput, dataset: Dataset) -> (Run, Vec<String>) {
         }
     }
     let mut run = Run::begin_on(input.check().expect("a request"), dataset).expect("a run");
-    let mut told = Told(Vec::new());
-    run.train(&mut [&mut told]).expect("trains");
-    (run, told.0)
+    let mut messages = PointMessages(Vec::new());
+    run.train(&mut [&mut messages]).expect("trains");
+    (run, messages.0)
 }
 
 #[test]
 fn points_are_found_on_surfaces_by_training_photographs_alone_and_again_on_resuming() {
     let folder = folder();
     let dataset = without_points();
-    let (run, told) = begun(input(folder.path(), "run", 6), dataset.clone());
+    let (run, messages) = begin_and_step(input(folder.path(), "run", 6), dataset.clone());
     let found = run.trainer().dataset.clone();
     let points = found.points.clone().expect("found");
     assert!(points.len() > 400, "{}", points.len());
     assert!(
-        told.len() == 1 && told[0].contains(&format!("{} were found", points.len())),
-        "{told:?}"
+        messages.len() == 1 && messages[0].contains(&format!("{} were found", points.len())),
+        "{messages:?}"
     );
     assert!(found.test.iter().all(|view| found.views[*view].points_seen.is_empty()));
     let seeing = found
@@ -84,7 +84,7 @@ fn points_are_found_on_surfaces_by_training_photographs_alone_and_again_on_resum
         "most photographs show points"
     );
     let errors = errors_of_depth(&found, &points);
-    let sound = errors.iter().filter(|error| **error < SOUND).count();
+    let sound = errors.iter().filter(|error| **error < MAX_DEPTH_ERROR).count();
     assert!(sound as f64 > 0.85 * errors.len() as f64, "{sound} of {}", errors.len());
 
     run.finish().expect("finishes");
@@ -109,8 +109,8 @@ fn points_are_not_found_where_they_are_given_not_wanted_or_nothing_matches() {
             match_points,
             ..input(folder.path(), name, 2)
         };
-        let (run, told) = begun(input, dataset.clone());
-        (run.trainer().dataset.points.clone(), told)
+        let (run, messages) = begin_and_step(input, dataset.clone());
+        (run.trainer().dataset.points.clone(), messages)
     };
     let mut bare = without_points();
     let points = Some(PointCloud {
@@ -132,8 +132,8 @@ fn points_are_not_found_where_they_are_given_not_wanted_or_nothing_matches() {
             mask: None,
         });
     }
-    let (points, told) = points_of("grey", &bare, true);
-    assert!(points.is_none() && told[0].contains("too few"), "{told:?}");
+    let (points, messages) = points_of("grey", &bare, true);
+    assert!(points.is_none() && messages[0].contains("too few"), "{messages:?}");
     bare.kind = "Blender".into();
     assert_eq!(points_of("rendered", &bare, true), (None, vec![]));
 }

@@ -44,7 +44,7 @@ pub(crate) fn photographs(folder: &Path) -> Vec<(String, Camera)> {
 }
 
 /// Degrees by which the rotations between successive photographs of `dataset` differ from the true ones, independent of the world.
-fn turned_off(dataset: &Dataset, truth: &[(String, Camera)]) -> Vec<f32> {
+fn rotation_errors(dataset: &Dataset, truth: &[(String, Camera)]) -> Vec<f32> {
     let of = |name: &str| {
         let (_, camera) = truth.iter().find(|(known, _)| name.ends_with(known.as_str())).unwrap();
         camera.pose.rotation
@@ -57,7 +57,7 @@ fn turned_off(dataset: &Dataset, truth: &[(String, Camera)]) -> Vec<f32> {
     dataset.views.windows(2).map(off).collect()
 }
 
-pub(crate) fn quietly(input: &PoseInput) -> Result<PoseReport, RunError> {
+pub(crate) fn pose_silently(input: &PoseInput) -> Result<PoseReport, RunError> {
     pose(input, &|_| {})
 }
 
@@ -192,7 +192,7 @@ fn ray_traced_photographs_get_their_poses_back_and_a_second_call_reuses_the_feat
     let dataset = read_dataset(&out, &DatasetOptions::default()).unwrap();
     assert_eq!(dataset.views.len(), report.registered);
     assert!(dataset.points.as_ref().is_some_and(|points| points.len() > 200));
-    let mut angles = turned_off(&dataset, &truth);
+    let mut angles = rotation_errors(&dataset, &truth);
     angles.sort_by(f32::total_cmp);
     assert!(angles[angles.len() / 2] < 0.5, "{angles:?}");
 
@@ -230,7 +230,7 @@ fn ray_traced_photographs_get_their_poses_back_and_a_second_call_reuses_the_feat
     };
     let mut in_metres = input.clone();
     in_metres.distances = vec![known.clone()];
-    let scale = quietly(&in_metres).unwrap().scale.expect("a scale");
+    let scale = pose_silently(&in_metres).unwrap().scale.expect("a scale");
     assert!(
         scale.distances == 1 && (1e-6..0.05).contains(&scale.scale_error),
         "{scale:?}"
@@ -264,7 +264,7 @@ fn ray_traced_photographs_get_their_poses_back_and_a_second_call_reuses_the_feat
         (known.photos.clone(), -1.0, "more than 0 metres"),
     ] {
         in_metres.distances = vec![KnownDistance { photos, metres }];
-        let error = quietly(&in_metres).unwrap_err().to_string();
+        let error = pose_silently(&in_metres).unwrap_err().to_string();
         assert!(error.contains(reason), "{error}");
     }
 }
@@ -274,7 +274,7 @@ fn folders_without_enough_photographs_have_one_clear_outcome() {
     let folder = tempfile::tempdir().unwrap();
     let refused = |photos: &Path, words: &[&str]| {
         let out = folder.path().join("out");
-        let error = quietly(&PoseInput::new(photos, &out)).unwrap_err().to_string();
+        let error = pose_silently(&PoseInput::new(photos, &out)).unwrap_err().to_string();
         assert!(
             !error.contains('\n') && words.iter().all(|word| error.contains(word)),
             "{error}"
@@ -323,7 +323,9 @@ fn folders_without_enough_photographs_have_one_clear_outcome() {
     // A dataset from another source is not replaced.
     let foreign = make("foreign");
     fs::create_dir(foreign.join("sparse")).unwrap();
-    let error = quietly(&PoseInput::new(&apart, &foreign)).unwrap_err().to_string();
+    let error = pose_silently(&PoseInput::new(&apart, &foreign))
+        .unwrap_err()
+        .to_string();
     assert!(error.contains("another source"), "{error}");
     let film = folder.path().join("film.mp4");
     fs::write(&film, "no film").unwrap();
@@ -376,7 +378,7 @@ fn photographs_far_apart_are_posed_as_they_look_from_the_front() {
             fs::remove_file(photos.join(name)).unwrap();
         }
     }
-    let report = quietly(&PoseInput::new(&photos, &out)).unwrap();
+    let report = pose_silently(&PoseInput::new(&photos, &out)).unwrap();
     let [first, second] = &report.attempts[..] else {
         panic!("{:?}", report.attempts)
     };
@@ -384,7 +386,7 @@ fn photographs_far_apart_are_posed_as_they_look_from_the_front() {
     assert!(first.registered < 8 && second.registered >= 13, "{:?}", report.attempts);
     assert_eq!(report.registered, second.registered);
     let dataset = read_dataset(&out, &DatasetOptions::default()).unwrap();
-    let off = turned_off(&dataset, &all);
+    let off = rotation_errors(&dataset, &all);
     assert!(off.iter().all(|off| *off < 3.0), "{off:?}");
 }
 
@@ -488,7 +490,7 @@ fn a_fisheye_is_found_without_metadata_and_photographs_are_added_to_it() {
         let frame = scene.trace(&shot.camera, 4, i as u64);
         write_png(&part.join(format!("{i:02}.png")), k.width, k.height, 4, &frame.rgba()).unwrap();
     }
-    let report = quietly(&PoseInput::new(&first, &out)).unwrap();
+    let report = pose_silently(&PoseInput::new(&first, &out)).unwrap();
     assert_eq!(report.registered, report.photos, "{report:#?}");
     assert!(
         (report.cameras[0].focal_px / truth - 1.0).abs() < 0.01,
@@ -503,7 +505,7 @@ fn a_fisheye_is_found_without_metadata_and_photographs_are_added_to_it() {
         into: true,
         ..PoseInput::new(&more, &out)
     };
-    let report = quietly(&added).unwrap();
+    let report = pose_silently(&added).unwrap();
     assert_eq!(
         (report.registered, report.left_out.len()),
         (options.views as usize, 0),
@@ -542,7 +544,7 @@ fn panoramas_in_folders_are_posed_by_their_faces() {
         truth.push((stem, shot.camera));
     }
     let (photos, out) = (folder.path().join("photos"), folder.path().join("data"));
-    let report = quietly(&PoseInput::new(&photos, &out)).unwrap();
+    let report = pose_silently(&PoseInput::new(&photos, &out)).unwrap();
     assert_eq!(report.photos, 6 * truth.len());
     assert_eq!(report.registered, report.photos, "{report:#?}");
     let dataset = read_dataset(&out, &DatasetOptions::default()).unwrap();
@@ -605,7 +607,7 @@ fn panoramas_in_folders_are_posed_by_their_faces() {
         into: true,
         ..PoseInput::new(&photos, &out)
     };
-    assert!(quietly(&into).unwrap_err().to_string().contains("panoramas"));
+    assert!(pose_silently(&into).unwrap_err().to_string().contains("panoramas"));
 }
 
 #[cfg(unix)]
@@ -617,12 +619,14 @@ fn colmap_is_driven_with_the_options_that_it_knows() {
     fs::create_dir(at("photos")).unwrap();
     photographs(&at("photos"));
     // The models that the fake COLMAP copies.
-    quietly(&PoseInput::new(at("photos"), at("ours"))).unwrap();
+    pose_silently(&PoseInput::new(at("photos"), at("ours"))).unwrap();
     let colmap = |option: &str| {
         let script = format!(
             "#!/bin/sh\nif [ \"$2\" = -h ]; then echo '  --{option} arg (=1)'; exit; fi\necho \"$@\" >> {log}\n\
-             if [ \"$1\" = mapper ]; then cp -r {ours}/0 \"$7\"; fi\n",
+             if [ \"$1\" = mapper ]; then cp -r {ours}/0 \"$7\"; fi\n\
+             if [ \"$6\" = --ImageReader.mask_path ]; then cp -r \"$7\" {seen}; fi\n",
             log = at("log").display(),
+            seen = at("seen").display(),
             ours = at("ours").join("sparse").display(),
         );
         fs::write(at("colmap"), script).unwrap();
@@ -631,13 +635,13 @@ fn colmap_is_driven_with_the_options_that_it_knows() {
     let mut input = PoseInput::new(at("photos"), at("theirs"));
     input.mapper = Mapper::Colmap;
     input.colmap = at("none").display().to_string();
-    let error = quietly(&input).unwrap_err().to_string();
+    let error = pose_silently(&input).unwrap_err().to_string();
     assert!(error.contains("install COLMAP"), "{error}");
     input.colmap = at("colmap").display().to_string();
     // Old and new names of the same option.
     for option in ["SiftExtraction.use_gpu", "FeatureExtraction.use_gpu"] {
         colmap(option);
-        let report = quietly(&input).unwrap();
+        let report = pose_silently(&input).unwrap();
         assert!(report.registered >= 30 && report.points > 500, "{report:?}");
         let log = fs::read_to_string(at("log")).unwrap();
         let steps: Vec<&str> = log.lines().rev().take(3).collect();
@@ -656,12 +660,24 @@ fn colmap_is_driven_with_the_options_that_it_knows() {
     }
     let dataset = read_dataset(&at("theirs"), &DatasetOptions::default()).unwrap();
     assert!(dataset.views.len() >= 30);
+    // Masks of any format reach it in the form that it knows.
+    fs::create_dir(at("photos/masks")).unwrap();
+    let half = image::GrayImage::from_fn(320, 240, |x, _| image::Luma([if x < 160 { 9 } else { 240 }]));
+    half.save(at("photos/masks/00_mask.jpg")).unwrap();
+    colmap("ImageReader.mask_path");
+    pose_silently(&input).unwrap();
+    let seen = image::open(at("seen/00.png.png")).unwrap().to_luma8();
+    assert_eq!(
+        (seen.dimensions(), seen.get_pixel(80, 120).0, seen.get_pixel(240, 120).0),
+        ((320, 240), [0], [255])
+    );
+    assert!(at("theirs/masks/00.png.jpg").is_file() && !at("theirs/masks_colmap").exists());
     fs::write(
         at("colmap"),
         "#!/bin/sh\n[ \"$2\" = -h ] && exit\n[ $1 = help ] && exit\necho first >&2\necho 'out of luck' >&2\nexit 3\n",
     )
     .unwrap();
-    let error = quietly(&input).unwrap_err().to_string();
+    let error = pose_silently(&input).unwrap_err().to_string();
     assert!(
         error.contains("feature_extractor failed") && error.ends_with("out of luck"),
         "{error}"
@@ -705,7 +721,7 @@ fn several_films_are_posed_together() {
         photos: films,
         ..PoseInput::new("", &out)
     };
-    let report = quietly(&input).unwrap();
+    let report = pose_silently(&input).unwrap();
     let names: Vec<String> = fs::read_dir(out.join("frames"))
         .unwrap()
         .map(|entry| entry.unwrap().file_name().into_string().unwrap())
@@ -740,7 +756,7 @@ fn films_are_read_as_they_look_and_damaged_ones_left_out() {
     let given = photographs(&photos);
     fs::write(photos.join("damaged.mp4"), "no film").unwrap();
     let out = folder.path().join("half 50%d");
-    let report = quietly(&PoseInput::new(&photos, &out)).unwrap();
+    let report = pose_silently(&PoseInput::new(&photos, &out)).unwrap();
     let left: Vec<&str> = report.left_out.iter().map(|left| left.name.as_str()).collect();
     assert!(left.contains(&"damaged.mp4"), "{left:?}");
     let is_frame = |path: &PathBuf| path.extension().is_some_and(|extension| extension == "jpg");

@@ -1,6 +1,6 @@
 //! Photographs that are added to a dataset.
 
-use crate::pose::{photographs, quietly};
+use crate::pose::{photographs, pose_silently};
 use irradia_formats::{DatasetOptions, read_dataset};
 use irradia_runs::PoseInput;
 use std::fs;
@@ -19,7 +19,7 @@ fn photographs_are_added_to_a_dataset_whose_poses_stay() {
     }
     fs::copy(at("photos").join("00.png"), at("more").join("again.png")).unwrap();
     let data = at("data");
-    let first = quietly(&PoseInput::new(at("photos"), &data)).unwrap();
+    let first = pose_silently(&PoseInput::new(at("photos"), &data)).unwrap();
     let positions = || {
         let dataset = read_dataset(&data, &DatasetOptions::default()).unwrap();
         let place = |view: &irradia_runs::scene::View| {
@@ -30,7 +30,7 @@ fn photographs_are_added_to_a_dataset_whose_poses_stay() {
     let before = positions();
     let mut input = PoseInput::new(at("more"), &data);
     input.into = true;
-    let second = quietly(&input).unwrap();
+    let second = pose_silently(&input).unwrap();
     assert_eq!(second.registered, first.registered + later.len(), "{second:#?}");
     let copy = second.left_out.iter().find(|left| left.name == "again.png").unwrap();
     assert!(copy.reason.contains("already, as 00.png"), "{copy:?}");
@@ -52,7 +52,7 @@ fn photographs_are_added_to_a_dataset_whose_poses_stay() {
         .fliph()
         .save(at("more").join("other.png"))
         .unwrap();
-    quietly(&input).unwrap();
+    pose_silently(&input).unwrap();
     assert!(sparse.join("0/project.ini").is_file() && sparse.join("1/images.bin").is_file());
     assert_eq!(fs::read(data.join("unused/sparse/0/images.bin")).unwrap(), theirs);
     assert!(before.iter().all(|view| positions().contains(view)), "poses stay");
@@ -65,14 +65,14 @@ fn photographs_are_added_to_a_dataset_whose_poses_stay() {
     fs::write(&images, [&bytes[..name], b"left/", &bytes[name..]].concat()).unwrap();
     let before = positions();
     assert!(before.iter().any(|view| view.0.contains("left")), "{before:?}");
-    quietly(&input).unwrap();
+    pose_silently(&input).unwrap();
     assert!(before.iter().all(|view| positions().contains(view)), "poses stay");
     fs::remove_file(at("more").join("other.png")).unwrap();
     // Having nothing to add, or no dataset at all, is reported in one line.
-    let error = quietly(&input).unwrap_err().to_string();
+    let error = pose_silently(&input).unwrap_err().to_string();
     assert!(error.contains("no photograph to add"), "{error}");
     let mut nowhere = PoseInput::new(at("more"), at("photos"));
     nowhere.into = true;
-    let error = quietly(&nowhere).unwrap_err().to_string();
+    let error = pose_silently(&nowhere).unwrap_err().to_string();
     assert!(error.contains("no COLMAP model"), "{error}");
 }

@@ -1,8 +1,9 @@
 //! Requests: validation, and their storage in a run's folder.
 
 use crate::{begin, dataset, folder, input, scene};
+use irradia_runs::formats::Lenses;
 use irradia_runs::prelude::*;
-use irradia_runs::{RunRecord, read_recipe};
+use irradia_runs::{ReadingOptions, RunRecord, read_recipe};
 use std::fs;
 use std::path::Path;
 
@@ -162,7 +163,7 @@ fn a_request_round_trips() {
             max_side: None,
             holdout: Some("5".into()),
             images: Some(std::path::absolute("photographs").expect("a path")),
-            lenses: irradia_formats::Lenses::Whole,
+            lenses: Lenses::Whole,
             readout: Some("0.5:left".to_owned()),
         },
         ..input(folder.path(), "run", 4)
@@ -185,6 +186,35 @@ fn a_request_round_trips() {
     let request = resumed.check().expect("a request");
     let recipe = read_recipe("classic", &asked.set).expect("a recipe");
     assert_eq!(request.recipe().hash(), recipe.hash());
+}
+
+#[test]
+fn options_take_precedence_over_those_of_a_run_even_if_they_are_the_defaults() {
+    let of_run = Reading {
+        downscale: 2.0,
+        max_side: None,
+        holdout: Some("5".into()),
+        lenses: Lenses::Whole,
+        ..Reading::default()
+    };
+    assert_eq!(ReadingOptions::default().with_fallback(of_run.clone()), of_run);
+    let usual = Reading::default();
+    let given = ReadingOptions {
+        max_side: usual.max_side,
+        lenses: Some(usual.lenses),
+        ..ReadingOptions::default()
+    };
+    let expected = Reading {
+        holdout: of_run.holdout.clone(),
+        ..usual
+    };
+    assert_eq!(given.with_fallback(of_run.clone()), expected);
+    let full = ReadingOptions {
+        full_size: true,
+        ..ReadingOptions::default()
+    };
+    let read = full.with_fallback(of_run);
+    assert_eq!((read.downscale, read.max_side, read.lenses), (1.0, None, Lenses::Whole));
 }
 
 #[test]

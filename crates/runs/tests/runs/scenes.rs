@@ -24,7 +24,7 @@ fn a_scene_takes_background_and_cameras_from_its_run_if_it_has_one() {
     );
 
     let sky = to_bytes(
-        &[NamedTensor::real("background", vec![3], &[0.25, 0.5, 0.75])],
+        &[NamedTensor::f32s("background", vec![3], &[0.25, 0.5, 0.75])],
         ("irradia_sky", "1".into()),
     );
     fs::write(path.join("sky.safetensors"), sky).expect("written");

@@ -7,12 +7,12 @@ use std::sync::mpsc::{Receiver, channel};
 use std::time::Duration;
 
 /// Notifies another thread of each step, and pauses after one step until it answers.
-struct HandsOver {
+struct PauseAt {
     pause_after: u64,
-    go_on: Receiver<()>,
+    resume: Receiver<()>,
 }
 
-impl Observer for HandsOver {
+impl Observer for PauseAt {
     fn on_event(&mut self, event: &Event, _trainer: &Trainer) -> Signal {
         match event {
             Event::Step(report) if report.step == self.pause_after => Signal::Pause,
@@ -21,7 +21,7 @@ impl Observer for HandsOver {
     }
 
     fn while_paused(&mut self, _trainer: &Trainer) -> Signal {
-        match self.go_on.try_recv() {
+        match self.resume.try_recv() {
             Ok(()) => Signal::Continue,
             Err(_) => Signal::Pause,
         }
@@ -47,7 +47,7 @@ fn a_snapshot_is_reused_until_a_step_is_made_and_does_not_change_the_run() {
         snapshots.newest().is_none() && snapshots.last().is_none(),
         "none before it runs"
     );
-    let (go_on, told) = channel();
+    let (resume, told) = channel();
     let viewer = std::thread::spawn(move || {
         let mut seen = vec![first(&snapshots)];
         while seen.last().is_some_and(|snapshot| snapshot.step < 10) {
@@ -57,15 +57,15 @@ fn a_snapshot_is_reused_until_a_step_is_made_and_does_not_change_the_run() {
         let paused = [snapshots.newest(), snapshots.newest()].map(|s| s.expect("running"));
         assert!(paused[0].step == 10 && Arc::ptr_eq(&paused[0], &paused[1]));
         assert!(Arc::ptr_eq(&paused[0], seen.last().expect("some")));
-        go_on.send(()).expect("the run waits");
+        resume.send(()).expect("the run waits");
         while seen.last().is_some_and(|snapshot| snapshot.step < 30) {
             seen.push(snapshots.newest().expect("running"));
         }
         (seen, snapshots)
     });
-    let mut observer = HandsOver {
+    let mut observer = PauseAt {
         pause_after: 10,
-        go_on: told,
+        resume: told,
     };
     run.train(&mut [&mut observer]).expect("trains");
     let (seen, snapshots) = viewer.join().expect("the viewer");

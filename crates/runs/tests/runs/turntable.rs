@@ -10,16 +10,16 @@ use std::path::Path;
 
 const SIZE: [u32; 2] = [320, 240];
 /// Photographs around the scene.
-const RING: usize = 32;
+const RING_PHOTOS: usize = 32;
 /// Distance from the cameras beyond which everything is background.
-const FAR: f32 = 6.0;
+const MIN_BACKGROUND_DISTANCE: f32 = 6.0;
 
 /// `[photographs][H, W]` whether each pixel is background.
 type Backgrounds = Vec<Vec<bool>>;
 
 /// What is behind the turning demo scene.
 #[derive(Clone, Copy, PartialEq)]
-enum Behind {
+enum Backdrop {
     /// The scene's own sky: the camera moves around the scene.
     Sky,
     /// A still wall of patches.
@@ -29,7 +29,7 @@ enum Behind {
 }
 
 /// Writes photographs all around the demo scene, from heights that vary by `wave`.
-fn turntable(photos: &Path, behind: Behind, wave: f32) -> Backgrounds {
+fn turntable(photos: &Path, backdrop: Backdrop, wave: f32) -> Backgrounds {
     fs::create_dir_all(photos).unwrap();
     let scene = SceneName::Demo.build(1).0;
     let mut rng = Rng::new(5, 5);
@@ -37,13 +37,13 @@ fn turntable(photos: &Path, behind: Behind, wave: f32) -> Backgrounds {
         .map(|_| [0; 3].map(|_: u8| rng.range(0.0, 256.0) as u8))
         .collect();
     let photograph = |i: usize| {
-        let azimuth = std::f32::consts::TAU * i as f32 / RING as f32;
+        let azimuth = std::f32::consts::TAU * i as f32 / RING_PHOTOS as f32;
         let away = Vec3::new(azimuth.cos(), azimuth.sin(), 0.45 + wave * (3.0 * azimuth).sin());
         let pose = Pose::look_at(4.0 * away, Vec3::Z * 0.3, Vec3::Z);
         let frame = scene.trace(
             &Camera::new(
                 pose,
-                Intrinsics::from_fov_x(SIZE[0], SIZE[1], if behind == Behind::Paper { 1.3 } else { 0.9 }),
+                Intrinsics::from_fov_x(SIZE[0], SIZE[1], if backdrop == Backdrop::Paper { 1.3 } else { 0.9 }),
             ),
             2,
             i as u64,
@@ -52,22 +52,22 @@ fn turntable(photos: &Path, behind: Behind, wave: f32) -> Backgrounds {
             .depth
             .data
             .iter()
-            .map(|depth| *depth > FAR || *depth == 0.0)
+            .map(|depth| *depth > MIN_BACKGROUND_DISTANCE || *depth == 0.0)
             .collect();
         let mut rgb = frame.color.to_u8();
         let light = 1.0 + 0.05 * (2.0 * azimuth).sin();
         for (at, pixel) in rgb.chunks_exact_mut(3).enumerate().filter(|(at, _)| far[*at]) {
             let [x, y] = [at % SIZE[0] as usize, at / SIZE[0] as usize];
-            match behind {
-                Behind::Sky => {}
-                Behind::Wall => pixel.copy_from_slice(&patches[y / 4 * 80 + x / 4]),
-                Behind::Paper => pixel.fill((light * (225.0 - 0.2 * x as f32)) as u8),
+            match backdrop {
+                Backdrop::Sky => {}
+                Backdrop::Wall => pixel.copy_from_slice(&patches[y / 4 * 80 + x / 4]),
+                Backdrop::Paper => pixel.fill((light * (225.0 - 0.2 * x as f32)) as u8),
             }
         }
         write_png(&photos.join(format!("{i:02}.png")), SIZE[0], SIZE[1], 3, &rgb).unwrap();
         far
     };
-    (0..RING).map(photograph).collect()
+    (0..RING_PHOTOS).map(photograph).collect()
 }
 
 /// Poses `photos` in `out`.
@@ -78,7 +78,7 @@ fn posed(photos: &Path, out: &Path) -> PoseReport {
 /// Angle from each photograph to the next, degrees.
 fn steps(out: &Path) -> Vec<f32> {
     let dataset = read_dataset(out, &DatasetOptions::default()).unwrap();
-    assert_eq!(dataset.views.len(), RING);
+    assert_eq!(dataset.views.len(), RING_PHOTOS);
     let turn = |pair: &[irradia_runs::scene::View]| {
         let [a, b] = [0, 1].map(|i: usize| pair[i].camera.pose.rotation);
         a.angle_between(b).to_degrees()
@@ -87,28 +87,28 @@ fn steps(out: &Path) -> Vec<f32> {
 }
 
 /// The fraction of background pixels that are masked, and the fraction of other pixels that are not.
-fn right(masks: &Path, backgrounds: &Backgrounds) -> [f64; 2] {
-    let (mut behind, mut before) = ([0usize; 2], [0usize; 2]);
+fn mask_accuracy(masks: &Path, backgrounds: &Backgrounds) -> [f64; 2] {
+    let (mut backdrop, mut before) = ([0usize; 2], [0usize; 2]);
     for (i, far) in backgrounds.iter().enumerate() {
         let mask = read_image(&masks.join(format!("{i:02}.png.png"))).unwrap();
         assert_eq!([mask.width, mask.height], SIZE);
         let kept = mask.data.chunks_exact(mask.channels as usize).map(|pixel| pixel[0] > 0);
         for (kept, far) in kept.zip(far) {
-            let [count, right] = if *far { &mut behind } else { &mut before };
+            let [count, right] = if *far { &mut backdrop } else { &mut before };
             *count += 1;
             *right += usize::from(kept != *far);
         }
     }
-    [behind, before].map(|[count, right]| right as f64 / count as f64)
+    [backdrop, before].map(|[count, right]| right as f64 / count as f64)
 }
 
 #[test]
 fn what_turns_is_posed_and_what_stands_still_behind_it_is_masked() {
     let folder = tempfile::tempdir().unwrap();
     let [photos, out] = ["photos", "data"].map(|name| folder.path().join(name));
-    let backgrounds = turntable(&photos, Behind::Wall, 0.1);
+    let backgrounds = turntable(&photos, Backdrop::Wall, 0.1);
     let report = posed(&photos, &out);
-    assert_eq!(report.registered, RING, "{report:?}");
+    assert_eq!(report.registered, RING_PHOTOS, "{report:?}");
     let told = |kind: &str| report.findings.iter().find(|finding| finding.kind == kind);
     assert!(told("stands-still").unwrap().sentence.ends_with("it is masked"));
     assert!(
@@ -124,8 +124,8 @@ fn what_turns_is_posed_and_what_stands_still_behind_it_is_masked() {
         steps(&out)
     );
     let masks = out.join("masks");
-    let [behind, before] = right(&masks, &backgrounds);
-    assert!(behind > 0.93 && before > 0.93, "{behind} {before}");
+    let [backdrop, before] = mask_accuracy(&masks, &backgrounds);
+    assert!(backdrop > 0.93 && before > 0.93, "{backdrop} {before}");
 
     // A second call gives the same result.
     let model = fs::read(out.join("sparse/0/images.bin")).unwrap();
@@ -139,9 +139,9 @@ fn what_turns_is_posed_and_what_stands_still_behind_it_is_masked() {
     let in_place = posed(&out, &out);
     assert_eq!(
         (in_place.registered, in_place.warnings.len()),
-        (RING, report.warnings.len())
+        (RING_PHOTOS, report.warnings.len())
     );
-    assert_eq!(fs::read_dir(&masks).unwrap().count(), RING + 1);
+    assert_eq!(fs::read_dir(&masks).unwrap().count(), RING_PHOTOS + 1);
     assert_eq!(fs::read(out.join("unused/masks/00.png.2.png")).unwrap(), kept);
     // Photographs with masks of their own keep them.
     let own = folder.path().join("own");
@@ -154,7 +154,7 @@ fn what_turns_is_posed_and_what_stands_still_behind_it_is_masked() {
     assert!(kept.warnings.is_empty(), "{:?}", kept.warnings);
     assert_eq!(fs::read_dir(folder.path().join("kept/masks")).unwrap().count(), 1);
     // If nothing stands still any more, nothing is masked.
-    turntable(&photos, Behind::Sky, 0.1);
+    turntable(&photos, Backdrop::Sky, 0.1);
     assert!(posed(&photos, &out).warnings.is_empty());
     assert!(!masks.exists());
 }
@@ -164,12 +164,12 @@ fn a_plain_backdrop_is_masked_where_the_poses_are_those_of_a_turntable() {
     let folder = tempfile::tempdir().unwrap();
     let [photos, out] = ["photos", "data"].map(|name| folder.path().join(name));
     let masks = out.join("masks");
-    let backgrounds = turntable(&photos, Behind::Paper, 0.0);
+    let backgrounds = turntable(&photos, Backdrop::Paper, 0.0);
     let report = posed(&photos, &out);
-    assert_eq!(report.registered, RING, "{report:?}");
-    let [behind, before] = right(&masks, &backgrounds);
+    assert_eq!(report.registered, RING_PHOTOS, "{report:?}");
+    let [backdrop, before] = mask_accuracy(&masks, &backgrounds);
     // Backdrop seen through the frames is not connected to the border, and bars are two pixels wide.
-    assert!(behind > 0.87 && before > 0.87, "{behind} {before}");
+    assert!(backdrop > 0.87 && before > 0.87, "{backdrop} {before}");
     let of = |report: &PoseReport| {
         report
             .warnings
@@ -180,7 +180,7 @@ fn a_plain_backdrop_is_masked_where_the_poses_are_those_of_a_turntable() {
     assert_eq!(of(&report), 1, "{:?}", report.warnings);
 
     // With a handheld camera, no axis stands still.
-    turntable(&photos, Behind::Paper, 0.3);
+    turntable(&photos, Backdrop::Paper, 0.3);
     assert_eq!(of(&posed(&photos, &out)), 0);
     assert!(!masks.exists());
 }

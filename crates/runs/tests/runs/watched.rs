@@ -6,25 +6,25 @@ use std::fs;
 use std::time::{Duration, Instant};
 
 /// Answers `answer` after step `at`, and keeps all events.
-struct At {
+struct SignalAt {
     step: u64,
     answer: Signal,
-    told: Vec<Event>,
+    events: Vec<Event>,
 }
 
-impl At {
+impl SignalAt {
     fn new(step: u64, answer: Signal) -> Self {
         Self {
             step,
             answer,
-            told: Vec::new(),
+            events: Vec::new(),
         }
     }
 }
 
-impl Observer for At {
+impl Observer for SignalAt {
     fn on_event(&mut self, event: &Event, _trainer: &Trainer) -> Signal {
-        self.told.push(event.clone());
+        self.events.push(event.clone());
         match event {
             Event::Step(report) if report.step == self.step => self.answer,
             _ => Signal::Continue,
@@ -33,14 +33,14 @@ impl Observer for At {
 }
 
 /// Pauses after a step for a while, saving meanwhile, and then continues or stops.
-struct Pauses {
+struct PauseObserver {
     after: u64,
-    questions: u32,
+    poll_count: u32,
     then: Signal,
     steps: Vec<u64>,
 }
 
-impl Observer for Pauses {
+impl Observer for PauseObserver {
     fn on_event(&mut self, event: &Event, _trainer: &Trainer) -> Signal {
         match event {
             Event::Step(report) => {
@@ -57,8 +57,8 @@ impl Observer for Pauses {
 
     fn while_paused(&mut self, trainer: &Trainer) -> Signal {
         assert_eq!(trainer.clock.step, self.after, "no step is made meanwhile");
-        self.questions += 1;
-        if self.questions < 4 { Signal::Pause } else { self.then }
+        self.poll_count += 1;
+        if self.poll_count < 4 { Signal::Pause } else { self.then }
     }
 }
 
@@ -66,7 +66,7 @@ impl Observer for Pauses {
 fn a_stopped_run_is_saved_and_resumes_to_the_bytes_of_an_uninterrupted_one() {
     let folder = folder();
     let mut run = begin(folder.path(), "run", 12);
-    let reason = run.train(&mut [&mut At::new(5, Signal::Stop)]).expect("trains");
+    let reason = run.train(&mut [&mut SignalAt::new(5, Signal::Stop)]).expect("trains");
     assert_eq!((reason.as_str(), run.trainer().clock.step), ("stopped", 5));
     let finished = run.finish().expect("finishes");
     assert!(!finished.complete && finished.report.steps == 5);
@@ -86,7 +86,7 @@ fn a_stopped_run_is_saved_and_resumes_to_the_bytes_of_an_uninterrupted_one() {
 fn a_stopped_run_may_be_trained_further_at_once() {
     let folder = folder();
     let mut run = begin(folder.path(), "run", 12);
-    run.train(&mut [&mut At::new(5, Signal::Stop)]).expect("trains");
+    run.train(&mut [&mut SignalAt::new(5, Signal::Stop)]).expect("trains");
     run.train(&mut []).expect("trains");
     let report = run.finish().expect("finishes").report;
     assert!(scene(folder.path(), "run") == unwatched(folder.path(), 12));
@@ -114,10 +114,10 @@ fn a_stopped_run_may_be_trained_further_at_once() {
 fn save_writes_a_checkpoint_and_reports_it() {
     let folder = folder();
     let mut run = begin(folder.path(), "run", 6);
-    let mut asks = At::new(3, Signal::Save);
+    let mut asks = SignalAt::new(3, Signal::Save);
     run.train(&mut [&mut asks]).expect("trains");
     let saved = |event: &Event| matches!(event, Event::Saved { step: 3, path } if path.ends_with("step_3.safetensors"));
-    assert!(asks.told.iter().any(saved), "{:?}", asks.told);
+    assert!(asks.events.iter().any(saved), "{:?}", asks.events);
     assert!(run.folder().file("checkpoints/step_3.safetensors").is_file());
 }
 
@@ -125,18 +125,18 @@ fn save_writes_a_checkpoint_and_reports_it() {
 fn a_paused_run_waits_and_resumes_to_the_same_bytes() {
     let folder = folder();
     let mut run = begin(folder.path(), "run", 8);
-    let mut pauses = Pauses {
+    let mut pauses = PauseObserver {
         after: 3,
-        questions: 0,
+        poll_count: 0,
         then: Signal::Continue,
         steps: Vec::new(),
     };
     let started = Instant::now();
     // A save request in the same step is also followed.
-    run.train(&mut [&mut At::new(3, Signal::Save), &mut pauses])
+    run.train(&mut [&mut SignalAt::new(3, Signal::Save), &mut pauses])
         .expect("trains");
     assert!(started.elapsed() > Duration::from_millis(40), "it waits between polls");
-    assert_eq!((pauses.questions, pauses.steps.len()), (4, 8));
+    assert_eq!((pauses.poll_count, pauses.steps.len()), (4, 8));
     assert!(run.folder().file("checkpoints/step_3.safetensors").is_file());
     let log = fs::read_to_string(run.folder().file("events.jsonl")).expect("events");
     for event in ["paused", "resumed"] {
@@ -150,9 +150,9 @@ fn a_paused_run_waits_and_resumes_to_the_same_bytes() {
 fn a_paused_run_can_be_stopped() {
     let folder = folder();
     let mut run = begin(folder.path(), "run", 8);
-    let mut pauses = Pauses {
+    let mut pauses = PauseObserver {
         after: 3,
-        questions: 0,
+        poll_count: 0,
         then: Signal::Stop,
         steps: Vec::new(),
     };
@@ -178,10 +178,10 @@ impl Observer for Warns {
 fn an_observers_warning_reaches_the_others_and_the_report_once() {
     let folder = folder();
     let mut run = begin(folder.path(), "run", 3);
-    let (mut warns, mut listens) = (Warns(Some("no sound".into())), At::new(0, Signal::Continue));
+    let (mut warns, mut listens) = (Warns(Some("no sound".into())), SignalAt::new(0, Signal::Continue));
     run.train(&mut [&mut warns, &mut listens]).expect("trains");
     let warned = |event: &&Event| matches!(event, Event::Warned { message } if message == "no sound");
-    assert_eq!(listens.told.iter().filter(warned).count(), 1);
+    assert_eq!(listens.events.iter().filter(warned).count(), 1);
     assert_eq!(run.finish().expect("finishes").report.warnings, ["no sound"]);
 }
 
@@ -205,9 +205,9 @@ fn a_stopped_evaluation_is_repeated_when_the_run_is_resumed() {
 }
 
 /// Requests a stop as soon as held-out views are evaluated.
-struct Impatient(Vec<Event>);
+struct StopRequester(Vec<Event>);
 
-impl Observer for Impatient {
+impl Observer for StopRequester {
     fn on_event(&mut self, event: &Event, _: &Trainer) -> Signal {
         self.0.push(event.clone());
         Signal::Continue
@@ -221,12 +221,12 @@ impl Observer for Impatient {
 #[test]
 fn a_partial_evaluation_is_not_reported() {
     let folder = folder();
-    let asked = TrainInput {
+    let requested = TrainInput {
         set: vec!["eval_every=2".into()],
         ..crate::input(folder.path(), "run", 5)
     };
-    let mut run = Run::begin_on(asked.check().expect("a request"), dataset()).expect("a run");
-    let mut observer = Impatient(Vec::new());
+    let mut run = Run::begin_on(requested.check().expect("a request"), dataset()).expect("a run");
+    let mut observer = StopRequester(Vec::new());
     run.train(&mut [&mut observer]).expect("trains");
     assert!(!observer.0.iter().any(|event| matches!(event, Event::Evaluated { .. })));
 }

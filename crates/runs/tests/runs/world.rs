@@ -12,18 +12,18 @@ use std::path::Path;
 const SCALE: f64 = 1000.0;
 const SHIFT: [f64; 3] = [5e8, -5e8, 1e5];
 
-fn far(position: [f64; 3]) -> [f64; 3] {
+fn to_far_world(position: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|i| SCALE * position[i] + SHIFT[i])
 }
 
 /// Moves the dataset in `folder`, its cameras and points.
-fn move_away(folder: &Path) {
+fn move_far_away(folder: &Path) {
     for part in ["train", "val", "test"] {
         let path = folder.join(format!("transforms_{part}.json"));
         let mut json: Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
         for frame in json["frames"].as_array_mut().unwrap() {
             let matrix = &mut frame["transform_matrix"];
-            let position = far([0, 1, 2].map(|row: usize| matrix[row][3].as_f64().unwrap()));
+            let position = to_far_world([0, 1, 2].map(|row: usize| matrix[row][3].as_f64().unwrap()));
             (0..3).for_each(|row| matrix[row][3] = json!(position[row]));
         }
         fs::write(&path, json.to_string()).unwrap();
@@ -34,7 +34,7 @@ fn move_away(folder: &Path) {
     text += "property double x\nproperty double y\nproperty double z\n";
     text += "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n";
     for (position, [r, g, b]) in points.positions.iter().zip(&points.colors) {
-        let [x, y, z] = far(position.as_dvec3().to_array());
+        let [x, y, z] = to_far_world(position.as_dvec3().to_array());
         writeln!(text, "{x} {y} {z} {r} {g} {b}").unwrap();
     }
     fs::write(&path, text).unwrap();
@@ -82,7 +82,7 @@ fn a_dataset_in_millimetres_500_km_away_trains_alike_and_is_exported_to_the_mill
     for name in ["near", "far"] {
         write_synth_dataset(folder.path().join(name), &options).unwrap();
     }
-    move_away(&folder.path().join("far"));
+    move_far_away(&folder.path().join("far"));
     let [near, away] = ["near", "far"].map(|name| train(folder.path(), name));
     // The cameras' median becomes the origin, so only rounding differs.
     assert!((near - away).abs() < 0.05, "{near} and {away} dB");
@@ -94,7 +94,7 @@ fn a_dataset_in_millimetres_500_km_away_trains_alike_and_is_exported_to_the_mill
     let position = |camera: &Value| [0, 1, 2].map(|i: usize| camera["position"][i].as_f64().unwrap());
     let [here, there] = ["near", "far"].map(cameras);
     for (here, there) in here.as_array().unwrap().iter().zip(there.as_array().unwrap()) {
-        let expected = far(position(here));
+        let expected = to_far_world(position(here));
         // In millimetres: at 10 m, f32 resolves a thousandth of one.
         assert!((0..3).all(|i| (position(there)[i] - expected[i]).abs() < 1e-2));
     }
@@ -110,7 +110,7 @@ fn a_dataset_in_millimetres_500_km_away_trains_alike_and_is_exported_to_the_mill
             std::array::from_fn(|i| sum[i] + p[i] / splats.len() as f64)
         })
     });
-    let expected = far(means[0]);
+    let expected = to_far_world(means[0]);
     assert!((0..3).all(|i| (means[1][i] - expected[i]).abs() < 1.0), "{means:?}");
 
     let data = Reading::default().read(&folder.path().join("far")).unwrap();

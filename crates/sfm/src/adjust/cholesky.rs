@@ -4,7 +4,7 @@ use irradia_compute::simd::{Kernel, Lanes, Level, Simd};
 use rayon::prelude::*;
 
 /// Rows factorised before the rest of the matrix is updated: a panel stays in the second-level cache.
-const PANEL: usize = 32;
+const PANEL_ROWS: usize = 32;
 
 /// A symmetric matrix whose upper triangle is stored, row by row.
 #[derive(Clone, Debug, Default)]
@@ -29,8 +29,8 @@ impl Symmetric {
     /// Zeros left of the first nonzero of a column stay zero and cost nothing, as in the banded systems of films.
     pub fn solve(&mut self, b: &mut [f64]) -> bool {
         let n = self.n;
-        for first in (0..n).step_by(PANEL) {
-            let last = (first + PANEL).min(n);
+        for first in (0..n).step_by(PANEL_ROWS) {
+            let last = (first + PANEL_ROWS).min(n);
             let (panel, below) = self.values[first * n..].split_at_mut((last - first) * n);
             for k in 0..last - first {
                 let (before, row) = panel.split_at_mut(k * n);

@@ -65,7 +65,7 @@ impl Freedom {
     }
 
     /// Which unknowns of a camera are adjusted. The first scales fx and fy together, the second moves fy alone.
-    fn columns(self) -> [bool; PARAMETERS] {
+    fn free_columns(self) -> [bool; PARAMETERS] {
         let focal = self.focal;
         [
             focal != Focal::Held,
@@ -88,7 +88,7 @@ pub struct AdjustedCamera {
     /// Which intrinsics are adjusted.
     pub freedom: Freedom,
     /// The prior.
-    pub belief: Belief,
+    pub prior: Prior,
 }
 
 impl AdjustedCamera {
@@ -97,21 +97,21 @@ impl AdjustedCamera {
         Self {
             camera,
             freedom,
-            belief: Belief::default(),
+            prior: Prior::default(),
         }
     }
 }
 
 /// A Gaussian prior on the parameters of a camera: the cost has a term `weight (parameter - value)^2 / 2` for each.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Belief {
+pub struct Prior {
     /// Expected values in the order of the parameters; in place of fy, the value of `fy / fx`.
     pub values: [f64; PARAMETERS],
     /// Weights, px^2 per squared unit of the parameter.
     pub weights: [f64; PARAMETERS],
 }
 
-impl Belief {
+impl Prior {
     /// The differences from the expected values.
     fn errors(&self, camera: &DCamera) -> [f64; PARAMETERS] {
         let mut errors = camera.parameters;
@@ -133,7 +133,7 @@ pub struct View {
     /// Index of the camera.
     pub camera: u32,
     /// Rotation of the camera's axes into those of the pose.
-    pub mount: DQuat,
+    pub rig_from_camera: DQuat,
 }
 
 impl View {
@@ -142,7 +142,7 @@ impl View {
         Self {
             pose,
             camera,
-            mount: DQuat::IDENTITY,
+            rig_from_camera: DQuat::IDENTITY,
         }
     }
 }
@@ -272,7 +272,7 @@ impl Problem {
     fn cost_at(&self, state: &State, loss: Loss) -> f64 {
         let views = state.views(self);
         let sums: Vec<f64> = self
-            .pieces()
+            .chunks()
             .into_par_iter()
             .map(|points| {
                 let mut sum = 0.0;
@@ -280,7 +280,7 @@ impl Problem {
                     for observation in &self.observations[self.starts[i] as usize..self.starts[i + 1] as usize] {
                         let view = &views[observation.view as usize];
                         let p = view.rotation * (state.points[i] - view.position);
-                        if p.z <= BEHIND {
+                        if p.z <= MIN_DEPTH {
                             return f64::INFINITY;
                         }
                         sum += loss
@@ -291,35 +291,35 @@ impl Problem {
                 sum
             })
             .collect();
-        0.5 * sums.iter().sum::<f64>() + self.belief_cost(state)
+        0.5 * sums.iter().sum::<f64>() + self.prior_cost(state)
     }
 
     /// The cost of the priors on the cameras.
-    fn belief_cost(&self, state: &State) -> f64 {
+    fn prior_cost(&self, state: &State) -> f64 {
         self.cameras
             .iter()
             .zip(&state.cameras)
-            .map(|(c, now)| c.belief.cost(now))
+            .map(|(c, now)| c.prior.cost(now))
             .sum()
     }
 
     /// Ranges of points with about equal numbers of observations; they depend only on the problem.
-    fn pieces(&self) -> Vec<std::ops::Range<usize>> {
+    fn chunks(&self) -> Vec<std::ops::Range<usize>> {
         let goal = (self.observations.len() / 64).max(256) as u32;
-        let mut pieces = Vec::new();
+        let mut chunks = Vec::new();
         let mut first = 0;
         for i in 0..self.points.len() {
             if self.starts[i + 1] - self.starts[first] >= goal || i + 1 == self.points.len() {
-                pieces.push(first..i + 1);
+                chunks.push(first..i + 1);
                 first = i + 1;
             }
         }
-        pieces
+        chunks
     }
 }
 
 /// Depth below which a point counts as behind its camera, in world units.
-const BEHIND: f64 = 1e-9;
+const MIN_DEPTH: f64 = 1e-9;
 
 /// The values that change during an adjustment.
 #[derive(Clone)]
@@ -330,23 +330,23 @@ struct State {
 }
 
 /// A view at the current values.
-struct ViewNow {
+struct ViewState {
     /// From world to camera axes.
     rotation: DMat3,
     position: DVec3,
     /// From camera axes to those of the pose.
-    mount: DMat3,
+    rig_from_camera: DMat3,
     camera: DCamera,
 }
 
 impl State {
-    fn views(&self, problem: &Problem) -> Vec<ViewNow> {
+    fn views(&self, problem: &Problem) -> Vec<ViewState> {
         let now = |view: &View| {
             let pose = &self.poses[view.pose as usize];
-            ViewNow {
-                rotation: DMat3::from_quat(view.mount.inverse()) * pose.camera_rotation(),
+            ViewState {
+                rotation: DMat3::from_quat(view.rig_from_camera.inverse()) * pose.camera_rotation(),
                 position: pose.position,
-                mount: DMat3::from_quat(view.mount),
+                rig_from_camera: DMat3::from_quat(view.rig_from_camera),
                 camera: self.cameras[view.camera as usize],
             }
         };

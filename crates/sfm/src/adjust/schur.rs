@@ -5,39 +5,39 @@
 //! slope; per point V = sum B^T B + damping; per point and block W = A^T B or K^T B.
 
 use super::cholesky::{Symmetric, conjugate_gradients};
-use super::{BEHIND, DIRECT_LIMIT, Loss, Problem, State, View};
+use super::{DIRECT_LIMIT, Loss, MIN_DEPTH, Problem, State, View};
 use crate::geometry::camera::PARAMETERS;
 use glam::{DMat3, DVec3};
 use irradia_compute::simd::{Kernel, Lanes, Level, Simd};
 use rayon::prelude::*;
 
-const POSE: usize = 6;
-const NONE: u32 = u32::MAX;
+const POSE_SIZE: usize = 6;
+const NO_BLOCK: u32 = u32::MAX;
 
 /// Weighted residual and Jacobians of one observation.
 #[derive(Clone, Copy)]
 struct Row {
     r: [f64; 2],
-    a: [[f64; POSE]; 2],
+    a: [[f64; POSE_SIZE]; 2],
     b: [[f64; 3]; 2],
     k: [[f64; PARAMETERS]; 2],
 }
 
-const EMPTY: Row = Row {
+const EMPTY_ROW: Row = Row {
     r: [0.0; 2],
-    a: [[0.0; POSE]; 2],
+    a: [[0.0; POSE_SIZE]; 2],
     b: [[0.0; 3]; 2],
     k: [[0.0; PARAMETERS]; 2],
 };
 
 /// Smallest and largest damped diagonal (Ceres' bounds).
-const DIAGONAL: (f64, f64) = (1e-6, 1e32);
+const DIAGONAL_BOUNDS: (f64, f64) = (1e-6, 1e32);
 
 /// The normal equations and the structure that does not change between iterations.
 pub(super) struct Linearization {
-    /// `[P]` the block of a pose, or NONE when it is held fixed.
+    /// `[P]` the block of a pose, or NO_BLOCK when it is held fixed.
     pose_block: Vec<u32>,
-    /// `[C]` the block of a camera, or NONE when it is held fixed or not observed.
+    /// `[C]` the block of a camera, or NO_BLOCK when it is held fixed or not observed.
     camera_block: Vec<u32>,
     pose_blocks: usize,
     camera_blocks: usize,
@@ -53,11 +53,11 @@ pub(super) struct Linearization {
     of_camera: Vec<Vec<(u32, u32)>>,
     rows: Vec<Row>,
     /// Per observation `A^T B`, `[3][6]`.
-    w: Vec<[[f64; POSE]; 3]>,
+    w: Vec<[[f64; POSE_SIZE]; 3]>,
     /// Per entry of `groups`, sums over the point's observations of `K^T B`, `[3][8]`.
     wk: Vec<[[f64; PARAMETERS]; 3]>,
     /// Per camera block and unknown: second and first derivative of the prior's cost.
-    beliefs: Vec<[[f64; 2]; PARAMETERS]>,
+    prior_terms: Vec<[[f64; 2]; PARAMETERS]>,
     /// Per point: sum of `B^T B` and of `B^T r`.
     v: Vec<(DMat3, DVec3)>,
 }
@@ -68,7 +68,7 @@ impl Linearization {
             let mut count = 0;
             let blocks: Vec<u32> = held
                 .map(|held| {
-                    let block = if held { NONE } else { count };
+                    let block = if held { NO_BLOCK } else { count };
                     count += u32::from(!held);
                     block
                 })
@@ -88,7 +88,7 @@ impl Linearization {
                 .cameras
                 .iter()
                 .zip(seen)
-                .map(|(c, seen)| !seen || !c.freedom.columns().contains(&true)),
+                .map(|(c, seen)| !seen || !c.freedom.free_columns().contains(&true)),
         );
         let n = problem.observations.len();
         let mut of_pose = vec![Vec::new(); pose_blocks];
@@ -101,12 +101,12 @@ impl Linearization {
                 let View { pose, camera, .. } = problem.views[problem.observations[o as usize].view as usize];
                 point_of.push(i as u32);
                 let block = pose_block[pose as usize];
-                if block != NONE {
+                if block != NO_BLOCK {
                     of_pose[block as usize].push(o);
                 }
                 let camera = camera_block[camera as usize];
                 camera_of_row.push(camera);
-                if camera != NONE && !groups[first..].contains(&camera) {
+                if camera != NO_BLOCK && !groups[first..].contains(&camera) {
                     of_camera[camera as usize].push((groups.len() as u32, i as u32));
                     groups.push(camera);
                 }
@@ -122,10 +122,10 @@ impl Linearization {
             point_of,
             camera_of_row,
             group_starts,
-            rows: vec![EMPTY; n],
-            w: vec![[[0.0; POSE]; 3]; n],
+            rows: vec![EMPTY_ROW; n],
+            w: vec![[[0.0; POSE_SIZE]; 3]; n],
             wk: vec![[[0.0; PARAMETERS]; 3]; groups.len()],
-            beliefs: Vec::new(),
+            prior_terms: Vec::new(),
             v: vec![(DMat3::ZERO, DVec3::ZERO); problem.points.len()],
             groups,
             of_camera,
@@ -141,31 +141,31 @@ impl Linearization {
             .zip(&state.cameras)
             .map(|(adjusted, camera)| {
                 let ratio = camera.parameters[1] / camera.parameters[0];
-                (adjusted.freedom.columns().map(f64::from), ratio)
+                (adjusted.freedom.free_columns().map(f64::from), ratio)
             })
             .collect();
-        let pieces = problem.pieces();
-        let mut jobs = Vec::with_capacity(pieces.len());
+        let chunks = problem.chunks();
+        let mut jobs = Vec::with_capacity(chunks.len());
         let (mut rows, mut w) = (&mut self.rows[..], &mut self.w[..]);
         let (mut wk, mut v) = (&mut self.wk[..], &mut self.v[..]);
-        for piece in pieces {
-            let observations = (problem.starts[piece.end] - problem.starts[piece.start]) as usize;
-            let groups = (self.group_starts[piece.end] - self.group_starts[piece.start]) as usize;
+        for chunk in chunks {
+            let observations = (problem.starts[chunk.end] - problem.starts[chunk.start]) as usize;
+            let groups = (self.group_starts[chunk.end] - self.group_starts[chunk.start]) as usize;
             let (rows_here, w_here, wk_here, v_here);
             (rows_here, rows) = rows.split_at_mut(observations);
             (w_here, w) = w.split_at_mut(observations);
             (wk_here, wk) = wk.split_at_mut(groups);
-            (v_here, v) = v.split_at_mut(piece.len());
-            jobs.push((piece, rows_here, w_here, wk_here, v_here));
+            (v_here, v) = v.split_at_mut(chunk.len());
+            jobs.push((chunk, rows_here, w_here, wk_here, v_here));
         }
         let (group_starts, groups, camera_of_row) = (&self.group_starts, &self.groups, &self.camera_of_row);
         let costs: Vec<f64> = jobs
             .into_par_iter()
-            .map(|(piece, rows, w, wk, v)| {
-                let (first_row, first_group) = (problem.starts[piece.start], group_starts[piece.start]);
+            .map(|(chunk, rows, w, wk, v)| {
+                let (first_row, first_group) = (problem.starts[chunk.start], group_starts[chunk.start]);
                 let mut cost = 0.0;
                 wk.fill([[0.0; PARAMETERS]; 3]);
-                for (i, v) in piece.clone().zip(v) {
+                for (i, v) in chunk.clone().zip(v) {
                     *v = (DMat3::ZERO, DVec3::ZERO);
                     let here = group_starts[i] as usize..group_starts[i + 1] as usize;
                     for o in problem.starts[i]..problem.starts[i + 1] {
@@ -173,9 +173,9 @@ impl Linearization {
                         let view = &views[observation.view as usize];
                         let at = (o - first_row) as usize;
                         let p = view.rotation * (state.points[i] - view.position);
-                        if p.z <= BEHIND {
-                            rows[at] = EMPTY;
-                            w[at] = [[0.0; POSE]; 3];
+                        if p.z <= MIN_DEPTH {
+                            rows[at] = EMPTY_ROW;
+                            w[at] = [[0.0; POSE_SIZE]; 3];
                             cost = f64::INFINITY;
                             continue;
                         }
@@ -188,19 +188,19 @@ impl Linearization {
                         row.r = (r * root).to_array();
                         let (mask, ratio) = columns[problem.views[observation.view as usize].camera as usize];
                         for e in 0..2 {
-                            let by = projection.by_point[e] * root;
+                            let jacobian = projection.point_jacobian[e] * root;
                             // d camera point / d turn: the cross product turn x p, in the pose's axes; / d point: the rotation.
-                            let turn = view.mount * p.cross(by);
-                            let point = view.rotation.transpose() * by;
+                            let turn = view.rig_from_camera * p.cross(jacobian);
+                            let point = view.rotation.transpose() * jacobian;
                             row.a[e] = [turn.x, turn.y, turn.z, -point.x, -point.y, -point.z];
                             row.b[e] = point.to_array();
                             for c in 0..PARAMETERS {
-                                row.k[e][c] = mask[c] * root * projection.by_camera[e][c];
+                                row.k[e][c] = mask[c] * root * projection.camera_jacobian[e][c];
                             }
-                            row.k[e][0] += mask[0] * ratio * root * projection.by_camera[e][1];
+                            row.k[e][0] += mask[0] * ratio * root * projection.camera_jacobian[e][1];
                         }
                         for x in 0..3 {
-                            for c in 0..POSE {
+                            for c in 0..POSE_SIZE {
                                 w[at][x][c] = row.b[0][x] * row.a[0][c] + row.b[1][x] * row.a[1][c];
                             }
                         }
@@ -210,7 +210,7 @@ impl Linearization {
                         }
                         v.1 += b[0] * row.r[0] + b[1] * row.r[1];
                         let block = camera_of_row[o as usize];
-                        if block != NONE {
+                        if block != NO_BLOCK {
                             let entry = here
                                 .clone()
                                 .find(|g| groups[*g] == block)
@@ -227,11 +227,11 @@ impl Linearization {
                 cost
             })
             .collect();
-        self.beliefs = (problem.cameras.iter().zip(&state.cameras).zip(&self.camera_block))
-            .filter(|(_, block)| **block != NONE)
+        self.prior_terms = (problem.cameras.iter().zip(&state.cameras).zip(&self.camera_block))
+            .filter(|(_, block)| **block != NO_BLOCK)
             .map(|((adjusted, now), _)| {
-                let columns = adjusted.freedom.columns();
-                let (errors, weights) = (adjusted.belief.errors(now), adjusted.belief.weights);
+                let columns = adjusted.freedom.free_columns();
+                let (errors, weights) = (adjusted.prior.errors(now), adjusted.prior.weights);
                 std::array::from_fn(|i| {
                     // The derivative of the ratio fy / fx by fy is 1 / fx.
                     let slope = if i == 1 { 1.0 / now.parameters[0] } else { 1.0 };
@@ -240,7 +240,7 @@ impl Linearization {
                 })
             })
             .collect();
-        0.5 * costs.iter().sum::<f64>() + problem.belief_cost(state)
+        0.5 * costs.iter().sum::<f64>() + problem.prior_cost(state)
     }
 
     /// The damped Gauss-Newton step; `None` where the system is not positive definite.
@@ -258,7 +258,7 @@ impl Linearization {
                 if inverse.is_finite() { inverse } else { DMat3::ZERO }
             })
             .collect();
-        let n = POSE * self.pose_blocks + PARAMETERS * self.camera_blocks;
+        let n = POSE_SIZE * self.pose_blocks + PARAMETERS * self.camera_blocks;
         let (mut system, right, diagonal) = self.reduce(problem, &inverses, damping, n);
         let mut solution = right.iter().map(|x| -x).collect::<Vec<f64>>();
         if n <= DIRECT_LIMIT {
@@ -267,8 +267,8 @@ impl Linearization {
             }
         } else {
             let blocks: Vec<(usize, usize)> = (0..self.pose_blocks)
-                .map(|i| (POSE * i, POSE))
-                .chain((0..self.camera_blocks).map(|i| (POSE * self.pose_blocks + PARAMETERS * i, PARAMETERS)))
+                .map(|i| (POSE_SIZE * i, POSE_SIZE))
+                .chain((0..self.camera_blocks).map(|i| (POSE_SIZE * self.pose_blocks + PARAMETERS * i, PARAMETERS)))
                 .collect();
             solution = conjugate_gradients(&system, &solution, &blocks, 1e-3, 200)?;
         }
@@ -290,18 +290,18 @@ impl Linearization {
         let mut system = Symmetric::zeros(n);
         let mut right = vec![0.0; n];
         let mut diagonal = vec![[0.0; 2]; n];
-        let cameras_at = POSE * self.pose_blocks;
+        let cameras_at = POSE_SIZE * self.pose_blocks;
         let (pose_rows, camera_rows) = system.values.split_at_mut(cameras_at * n);
         let (pose_right, camera_right) = right.split_at_mut(cameras_at);
         let (pose_diagonal, camera_diagonal) = diagonal.split_at_mut(cameras_at);
         pose_rows
-            .par_chunks_mut((POSE * n).max(1))
-            .zip(pose_right.par_chunks_mut(POSE))
-            .zip(pose_diagonal.par_chunks_mut(POSE))
+            .par_chunks_mut((POSE_SIZE * n).max(1))
+            .zip(pose_right.par_chunks_mut(POSE_SIZE))
+            .zip(pose_diagonal.par_chunks_mut(POSE_SIZE))
             .enumerate()
             .for_each(|(pose, ((rows, right), diagonal))| {
                 Level::detect().run(PoseRows {
-                    of: self,
+                    linear: self,
                     problem,
                     inverses,
                     damping,
@@ -313,13 +313,13 @@ impl Linearization {
                 });
             });
         // A shared camera may see every point: its sums are split into pieces that are added in order.
-        let pieces = 16usize.div_ceil(self.camera_blocks.max(1));
+        let chunks = 16usize.div_ceil(self.camera_blocks.max(1));
         for c in 0..self.camera_blocks {
             let entries = &self.of_camera[c];
-            let size = entries.len().div_ceil(pieces).max(1);
-            let parts: Vec<CameraPart> = entries
+            let size = entries.len().div_ceil(chunks).max(1);
+            let parts: Vec<CameraSums> = entries
                 .par_chunks(size)
-                .map(|entries| self.camera_part(problem, c, entries, inverses))
+                .map(|entries| self.camera_sums(problem, c, entries, inverses))
                 .collect();
             let rows = &mut camera_rows[c * PARAMETERS * n..(c + 1) * PARAMETERS * n];
             for part in &parts {
@@ -330,14 +330,14 @@ impl Linearization {
                     for j in 0..PARAMETERS {
                         rows[i * n + cameras_at + c * PARAMETERS + j] += part.own[i][j];
                     }
-                    for (other, block) in &part.minus {
+                    for (other, block) in &part.eliminated {
                         for j in 0..PARAMETERS {
                             rows[i * n + cameras_at + *other as usize * PARAMETERS + j] -= block[i][j];
                         }
                     }
                 }
             }
-            for (i, [second, first]) in self.beliefs[c].into_iter().enumerate() {
+            for (i, [second, first]) in self.prior_terms[c].into_iter().enumerate() {
                 camera_right[c * PARAMETERS + i] += first;
                 camera_diagonal[c * PARAMETERS + i][0] += second;
                 camera_diagonal[c * PARAMETERS + i][1] += first;
@@ -347,7 +347,7 @@ impl Linearization {
                 let damped = if own == 0.0 {
                     1.0
                 } else {
-                    damping * own.clamp(DIAGONAL.0, DIAGONAL.1)
+                    damping * own.clamp(DIAGONAL_BOUNDS.0, DIAGONAL_BOUNDS.1)
                 };
                 rows[i * n + cameras_at + c * PARAMETERS + i] += damped;
             }
@@ -355,8 +355,8 @@ impl Linearization {
         (system, right, diagonal)
     }
 
-    fn camera_part(&self, problem: &Problem, c: usize, entries: &[(u32, u32)], inverses: &[DMat3]) -> CameraPart {
-        let mut part = CameraPart::default();
+    fn camera_sums(&self, problem: &Problem, c: usize, entries: &[(u32, u32)], inverses: &[DMat3]) -> CameraSums {
+        let mut part = CameraSums::default();
         let starts = &self.group_starts;
         for &(entry, point) in entries {
             let point = point as usize;
@@ -372,14 +372,14 @@ impl Linearization {
                 if (block as usize) < c {
                     continue;
                 }
-                let at = match part.minus.iter().position(|m| m.0 == block) {
+                let at = match part.eliminated.iter().position(|m| m.0 == block) {
                     Some(at) => at,
                     None => {
-                        part.minus.push((block, [[0.0; PARAMETERS]; PARAMETERS]));
-                        part.minus.len() - 1
+                        part.eliminated.push((block, [[0.0; PARAMETERS]; PARAMETERS]));
+                        part.eliminated.len() - 1
                     }
                 };
-                let to = &mut part.minus[at].1;
+                let to = &mut part.eliminated[at].1;
                 let w = &self.wk[other];
                 for i in 0..PARAMETERS {
                     for j in 0..PARAMETERS {
@@ -417,7 +417,7 @@ impl Linearization {
         diagonal: &[[f64; 2]],
         damping: f64,
     ) -> Step {
-        let cameras_at = POSE * self.pose_blocks;
+        let cameras_at = POSE_SIZE * self.pose_blocks;
         let points: Vec<(DVec3, f64)> = (0..self.v.len())
             .into_par_iter()
             .map(|i| {
@@ -428,8 +428,8 @@ impl Linearization {
                 let mut right = *gradient;
                 for o in problem.starts[i] as usize..problem.starts[i + 1] as usize {
                     let block = self.pose_block[problem.pose_of(o)];
-                    if block != NONE {
-                        let x = &reduced[POSE * block as usize..][..POSE];
+                    if block != NO_BLOCK {
+                        let x = &reduced[POSE_SIZE * block as usize..][..POSE_SIZE];
                         right += DVec3::from_array(self.w[o].map(|w| w.iter().zip(x).map(|(w, x)| w * x).sum()));
                     }
                 }
@@ -445,10 +445,10 @@ impl Linearization {
         // The model's decrease, 1/2 dx^T (damping D dx - g).
         let mut predicted: f64 = points.iter().map(|p| p.1).sum();
         for (x, [own, gradient]) in reduced.iter().zip(diagonal) {
-            predicted += 0.5 * x * (damping * own.clamp(DIAGONAL.0, DIAGONAL.1) * x - gradient);
+            predicted += 0.5 * x * (damping * own.clamp(DIAGONAL_BOUNDS.0, DIAGONAL_BOUNDS.1) * x - gradient);
         }
         let pose = |block: u32| {
-            let x = &reduced[POSE * block as usize..][..POSE];
+            let x = &reduced[POSE_SIZE * block as usize..][..POSE_SIZE];
             (DVec3::from_slice(x), DVec3::from_slice(&x[3..]))
         };
         let camera = |block: u32| {
@@ -456,11 +456,15 @@ impl Linearization {
             std::array::from_fn(|i| x[i])
         };
         Step {
-            poses: self.pose_block.iter().map(|b| (*b != NONE).then(|| pose(*b))).collect(),
+            poses: self
+                .pose_block
+                .iter()
+                .map(|b| (*b != NO_BLOCK).then(|| pose(*b)))
+                .collect(),
             cameras: self
                 .camera_block
                 .iter()
-                .map(|b| (*b != NONE).then(|| camera(*b)))
+                .map(|b| (*b != NO_BLOCK).then(|| camera(*b)))
                 .collect(),
             points: points.into_iter().map(|p| p.0).collect(),
             predicted,
@@ -470,7 +474,7 @@ impl Linearization {
 
 /// What the Levenberg-Marquardt method adds to the diagonal of V.
 fn damp(x: f64, y: f64, z: f64, damping: f64) -> DVec3 {
-    damping * DVec3::new(x, y, z).clamp(DVec3::splat(DIAGONAL.0), DVec3::splat(DIAGONAL.1))
+    damping * DVec3::new(x, y, z).clamp(DVec3::splat(DIAGONAL_BOUNDS.0), DVec3::splat(DIAGONAL_BOUNDS.1))
 }
 
 /// `w inverse`, both as `[3][N]`.
@@ -498,7 +502,7 @@ fn subtract_product<const N: usize, const M: usize>(y: &[[f64; N]; 3], w: &[[f64
 
 /// One camera's sums over some points.
 #[derive(Default)]
-struct CameraPart {
+struct CameraSums {
     /// Sum of `K^T K`.
     own: [[f64; PARAMETERS]; PARAMETERS],
     /// Sum of `K^T r`.
@@ -506,12 +510,12 @@ struct CameraPart {
     /// Gradient with the points eliminated.
     right: [f64; PARAMETERS],
     /// Per camera block from this one on: sum of `W V^-1 W^T`.
-    minus: Vec<(u32, [[f64; PARAMETERS]; PARAMETERS])>,
+    eliminated: Vec<(u32, [[f64; PARAMETERS]; PARAMETERS])>,
 }
 
 /// The six rows of one pose in the reduced system; every row is written by one task only.
 struct PoseRows<'a> {
-    of: &'a Linearization,
+    linear: &'a Linearization,
     problem: &'a Problem,
     inverses: &'a [DMat3],
     damping: f64,
@@ -532,7 +536,7 @@ impl Kernel for PoseRows<'_> {
         S::F: Lanes<Scalar = f32>,
     {
         let Self {
-            of,
+            linear,
             problem,
             inverses,
             damping,
@@ -542,28 +546,28 @@ impl Kernel for PoseRows<'_> {
             right,
             diagonal,
         } = self;
-        let mut poses = vec![[[0.0; POSE]; POSE]; of.pose_blocks - pose];
-        let mut cameras = vec![[[0.0; PARAMETERS]; POSE]; of.camera_blocks];
-        let mut reduced = [0.0; POSE];
-        let mut gradient = [0.0; POSE];
-        let mut own = [[0.0; POSE]; POSE];
-        for &o in &of.of_pose[pose] {
+        let mut poses = vec![[[0.0; POSE_SIZE]; POSE_SIZE]; linear.pose_blocks - pose];
+        let mut cameras = vec![[[0.0; PARAMETERS]; POSE_SIZE]; linear.camera_blocks];
+        let mut reduced = [0.0; POSE_SIZE];
+        let mut gradient = [0.0; POSE_SIZE];
+        let mut own = [[0.0; POSE_SIZE]; POSE_SIZE];
+        for &o in &linear.of_pose[pose] {
             let o = o as usize;
-            let point = of.point_of[o] as usize;
-            let row = &of.rows[o];
+            let point = linear.point_of[o] as usize;
+            let row = &linear.rows[o];
             for e in 0..2 {
-                for i in 0..POSE {
+                for i in 0..POSE_SIZE {
                     gradient[i] += row.a[e][i] * row.r[e];
-                    for j in 0..POSE {
+                    for j in 0..POSE_SIZE {
                         own[i][j] += row.a[e][i] * row.a[e][j];
                     }
                 }
             }
-            let camera = of.camera_of_row[o];
-            if camera != NONE {
+            let camera = linear.camera_of_row[o];
+            if camera != NO_BLOCK {
                 let to = &mut cameras[camera as usize];
                 for e in 0..2 {
-                    for i in 0..POSE {
+                    for i in 0..POSE_SIZE {
                         for j in 0..PARAMETERS {
                             to[i][j] += row.a[e][i] * row.k[e][j];
                         }
@@ -573,36 +577,36 @@ impl Kernel for PoseRows<'_> {
             if problem.held_points[point] {
                 continue;
             }
-            let y = times_inverse(&of.w[o], &inverses[point]);
-            let g = of.v[point].1;
-            for i in 0..POSE {
+            let y = times_inverse(&linear.w[o], &inverses[point]);
+            let g = linear.v[point].1;
+            for i in 0..POSE_SIZE {
                 reduced[i] -= y[0][i] * g.x + y[1][i] * g.y + y[2][i] * g.z;
             }
             for other in problem.starts[point] as usize..problem.starts[point + 1] as usize {
-                let block = of.pose_block[problem.pose_of(other)];
-                if block != NONE && block as usize >= pose {
-                    subtract_product(&y, &of.w[other], &mut poses[block as usize - pose]);
+                let block = linear.pose_block[problem.pose_of(other)];
+                if block != NO_BLOCK && block as usize >= pose {
+                    subtract_product(&y, &linear.w[other], &mut poses[block as usize - pose]);
                 }
             }
-            for entry in of.group_starts[point] as usize..of.group_starts[point + 1] as usize {
-                subtract_product(&y, &of.wk[entry], &mut cameras[of.groups[entry] as usize]);
+            for entry in linear.group_starts[point] as usize..linear.group_starts[point + 1] as usize {
+                subtract_product(&y, &linear.wk[entry], &mut cameras[linear.groups[entry] as usize]);
             }
         }
-        let cameras_at = POSE * of.pose_blocks;
-        for i in 0..POSE {
+        let cameras_at = POSE_SIZE * linear.pose_blocks;
+        for i in 0..POSE_SIZE {
             right[i] = gradient[i] + reduced[i];
             diagonal[i] = [own[i][i], gradient[i]];
             let row = &mut rows[i * n..(i + 1) * n];
             for (block, values) in poses.iter().enumerate() {
-                row[POSE * (pose + block)..][..POSE].copy_from_slice(&values[i]);
+                row[POSE_SIZE * (pose + block)..][..POSE_SIZE].copy_from_slice(&values[i]);
             }
             for (block, values) in cameras.iter().enumerate() {
                 row[cameras_at + PARAMETERS * block..][..PARAMETERS].copy_from_slice(&values[i]);
             }
-            for j in 0..POSE {
-                row[POSE * pose + j] += own[i][j];
+            for j in 0..POSE_SIZE {
+                row[POSE_SIZE * pose + j] += own[i][j];
             }
-            row[POSE * pose + i] += damping * own[i][i].clamp(DIAGONAL.0, DIAGONAL.1);
+            row[POSE_SIZE * pose + i] += damping * own[i][i].clamp(DIAGONAL_BOUNDS.0, DIAGONAL_BOUNDS.1);
         }
     }
 }

@@ -131,7 +131,7 @@ fn the_gradient_vanishes_at_the_solution() {
                 radial: 1,
                 ..Freedom::HELD
             };
-            camera.belief = Belief {
+            camera.prior = Prior {
                 values: [480.0, 1.02, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0],
                 weights: [0.1, 1e5, 0.0, 0.0, 1e4, 0.0, 0.0, 0.0],
             };
@@ -207,12 +207,12 @@ fn points_behind_a_camera_do_not_break_it() {
 
 /// One pose and free points: only the priors determine the camera.
 #[test]
-fn what_is_believed_of_a_camera_decides_where_nothing_else_does() {
+fn a_prior_decides_where_nothing_else_does() {
     let (_, mut problem) = world(1, 30, 1, 0.0, 6);
     problem.held_poses[0] = true;
     problem.cameras[0].freedom = EVERYTHING;
     // Each point can follow any camera: only the priors have a minimum.
-    problem.cameras[0].belief = Belief {
+    problem.cameras[0].prior = Prior {
         values: [510.0, 1.01, 322.0, 241.0, 0.02, -0.02, 0.0, 0.0],
         weights: [1e2, 1e6, 1e2, 1e2, 1e6, 1e6, 1e6, 1e6],
     };
@@ -275,7 +275,7 @@ fn cameras_on_a_rig_move_with_it() {
         // The position of the rig, with the axes of each of its cameras.
         for (view, pose) in [(i, first), (i + 1, second)] {
             problem.views[view] = View {
-                mount: first.rotation.inverse() * pose.rotation,
+                rig_from_camera: first.rotation.inverse() * pose.rotation,
                 ..View::new(i as u32, 0)
             };
             let seen = DPose {

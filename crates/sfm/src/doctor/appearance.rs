@@ -1,16 +1,16 @@
 //! Sharpness and exposure of a photograph, measured from its pixels.
 
 /// Levels, of 255, at and above (white) or at and below (black) which a pixel has no detail left.
-const WHITE: u8 = 250;
-const BLACK: u8 = 4;
+const MIN_WHITE_LEVEL: u8 = 250;
+const MAX_BLACK_LEVEL: u8 = 4;
 /// Side of the blocks in which sharpness is measured, px.
-const BLOCK: usize = 32;
+const BLOCK_SIDE: usize = 32;
 /// Fraction of the blocks that count, the sharpest: a near subject in front of an unfocused background is sharp.
-const SHARPEST: f64 = 0.2;
+const SHARPEST_FRACTION: f64 = 0.2;
 /// Distance between the pixels of a coarse difference, px.
-const COARSE: usize = 8;
+const COARSE_STEP: usize = 8;
 /// The photograph is reduced until its long side is at most this, px: a blur of single pixels in large photographs does no harm.
-const LONG_SIDE: usize = 1000;
+const MAX_LONG_SIDE: usize = 1000;
 
 /// Measurements of a photograph's pixels.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -52,37 +52,37 @@ impl Appearance {
     /// When the length of the pixels or of the mask is not width times height.
     pub fn measure(width: usize, height: usize, grey: &[u8], mask: Option<&[u8]>) -> Self {
         assert_eq!(grey.len(), width * height);
-        let seen = |i: usize| mask.is_none_or(|mask| mask[i] >= 128);
+        let is_visible = |i: usize| mask.is_none_or(|mask| mask[i] >= 128);
         let (mut count, mut sum, mut white, mut black) = (0u64, 0u64, 0u64, 0u64);
-        for (_, value) in grey.iter().enumerate().filter(|(i, _)| seen(*i)) {
+        for (_, value) in grey.iter().enumerate().filter(|(i, _)| is_visible(*i)) {
             count += 1;
             sum += u64::from(*value);
-            white += u64::from(*value >= WHITE);
-            black += u64::from(*value <= BLACK);
+            white += u64::from(*value >= MIN_WHITE_LEVEL);
+            black += u64::from(*value <= MAX_BLACK_LEVEL);
         }
-        let of = |part: u64| (part as f64 / count.max(1) as f64) as f32;
-        let reduced = Reduced::new(width, height, grey, mask);
+        let fraction = |part: u64| (part as f64 / count.max(1) as f64) as f32;
+        let reduced = ReducedPhoto::new(width, height, grey, mask);
         Self {
             sharpness: reduced.sharpness(),
-            brightness: of(sum) / 255.0,
-            white: of(white),
-            black: of(black),
+            brightness: fraction(sum) / 255.0,
+            white: fraction(white),
+            black: fraction(black),
             hidden: ((grey.len() as u64 - count) as f64 / grey.len().max(1) as f64) as f32,
         }
     }
 }
 
 /// A photograph at the size at which sharpness is measured.
-struct Reduced {
+struct ReducedPhoto {
     width: usize,
     height: usize,
     /// Means of the pixels that were reduced to one; `NAN` where masked.
     grey: Vec<f32>,
 }
 
-impl Reduced {
+impl ReducedPhoto {
     fn new(width: usize, height: usize, grey: &[u8], mask: Option<&[u8]>) -> Self {
-        let factor = width.max(height).div_ceil(LONG_SIDE).max(1);
+        let factor = width.max(height).div_ceil(MAX_LONG_SIDE).max(1);
         let (w, h) = (width / factor, height / factor);
         let mean = |x: usize, y: usize| {
             let mut sum = 0.0;
@@ -107,15 +107,15 @@ impl Reduced {
     /// Energy of fine and of coarse differences in four directions, in the block from `x0, y0`.
     fn energies(&self, x0: usize, y0: usize) -> [[f64; 2]; 4] {
         let mut sums = [[0.0; 2]; 4];
-        for y in y0..y0 + BLOCK {
-            for x in x0..x0 + BLOCK {
+        for y in y0..y0 + BLOCK_SIDE {
+            for x in x0..x0 + BLOCK_SIDE {
                 let at = |dx: usize, dy: usize| self.grey[(y + dy) * self.width + x + dx];
                 // Both diagonals start in the same rows, so that all directions use the same pixels.
                 for (sum, [from, near, far]) in sums.iter_mut().zip([
-                    [at(0, 0), at(1, 0), at(COARSE, 0)],
-                    [at(0, 0), at(0, 1), at(0, COARSE)],
-                    [at(0, 0), at(1, 1), at(COARSE, COARSE)],
-                    [at(COARSE, 0), at(COARSE - 1, 1), at(0, COARSE)],
+                    [at(0, 0), at(1, 0), at(COARSE_STEP, 0)],
+                    [at(0, 0), at(0, 1), at(0, COARSE_STEP)],
+                    [at(0, 0), at(1, 1), at(COARSE_STEP, COARSE_STEP)],
+                    [at(COARSE_STEP, 0), at(COARSE_STEP - 1, 1), at(0, COARSE_STEP)],
                 ]) {
                     let (fine, coarse) = (near - from, far - from);
                     if coarse.is_finite() && fine.is_finite() {
@@ -130,20 +130,20 @@ impl Reduced {
 
     fn sharpness(&self) -> f32 {
         let mut blocks: Vec<[[f64; 2]; 4]> = Vec::new();
-        let last = |side: usize| side.saturating_sub(BLOCK + COARSE);
-        for y in (0..last(self.height)).step_by(BLOCK) {
-            for x in (0..last(self.width)).step_by(BLOCK) {
+        let last = |side: usize| side.saturating_sub(BLOCK_SIDE + COARSE_STEP);
+        for y in (0..last(self.height)).step_by(BLOCK_SIDE) {
+            for x in (0..last(self.width)).step_by(BLOCK_SIDE) {
                 blocks.push(self.energies(x, y));
             }
         }
         let fine = |block: &[[f64; 2]; 4]| block.iter().map(|sums| sums[0]).sum::<f64>();
         blocks.sort_by(|a, b| fine(b).total_cmp(&fine(a)));
-        blocks.truncate(((blocks.len() as f64 * SHARPEST) as usize).max(4));
+        blocks.truncate(((blocks.len() as f64 * SHARPEST_FRACTION) as usize).max(4));
         let ratio = |direction: usize| {
             let [fine, coarse] = [0, 1].map(|scale| blocks.iter().map(|block| block[direction][scale]).sum::<f64>());
             // Noise of one grey level in every pixel is not contrast.
-            let least = (blocks.len() * BLOCK * BLOCK) as f64;
-            if coarse > least { fine / coarse } else { 0.0 }
+            let noise_energy = (blocks.len() * BLOCK_SIDE * BLOCK_SIDE) as f64;
+            if coarse > noise_energy { fine / coarse } else { 0.0 }
         };
         (0..4).map(ratio).fold(f64::INFINITY, f64::min) as f32
     }

@@ -2,15 +2,15 @@
 //! away from the centre.
 
 use super::{Diagnosis, Evidence};
-use crate::map::{PairKind, Source, Zoom, determines_focal};
+use crate::map::{FocalSource, PairKind, Zoom, determines_focal};
 
 /// Minimum ratio of focal lengths in the metadata for two settings: smaller ones come from focus breathing.
-const SETTING: f64 = 1.08;
+const MIN_SETTING_RATIO: f64 = 1.08;
 /// Minimum fraction of pairs that show depth for a focal length to be adjustable.
-const GENERAL: f64 = 0.25;
+const MIN_GENERAL_FRACTION: f64 = 0.25;
 /// Minimum distance of a principal point from the centre, relative to the long side, for a photograph to count as cropped: those of
 /// phones are up to 1 % away, and those estimated from ten photographs up to 3 %.
-const BESIDE: f64 = 0.04;
+const MIN_PRINCIPAL_OFFSET: f64 = 0.04;
 
 /// Several focal lengths in the metadata.
 pub(super) fn settings(evidence: &Evidence) -> Vec<Diagnosis> {
@@ -25,7 +25,7 @@ pub(super) fn settings(evidence: &Evidence) -> Vec<Diagnosis> {
     let mut settings: Vec<(f64, Vec<usize>)> = Vec::new();
     let mut last = 0.0;
     for (focal, photo) in known {
-        if last * SETTING < focal {
+        if last * MIN_SETTING_RATIO < focal {
             settings.push((focal, Vec::new()));
         }
         settings.last_mut().expect("just added").1.push(photo);
@@ -41,11 +41,11 @@ pub(super) fn settings(evidence: &Evidence) -> Vec<Diagnosis> {
 
 /// Photographs whose focal lengths in the model differ from those of their camera.
 pub(super) fn zoom(evidence: &Evidence) -> Vec<Diagnosis> {
-    let told = |zoom: &Zoom| Diagnosis::Zoom {
+    let diagnosis = |zoom: &Zoom| Diagnosis::Zoom {
         photos: zoom.photos.clone(),
         ratio: zoom.focals[1] / zoom.focals[0],
     };
-    evidence.zooms.iter().map(told).collect()
+    evidence.zooms.iter().map(diagnosis).collect()
 }
 
 /// Photographs that became cameras of their own.
@@ -58,34 +58,34 @@ pub(super) fn own_focals(evidence: &Evidence) -> Vec<Diagnosis> {
         .collect();
     focals.sort_by(|a, b| a.0.total_cmp(&b.0));
     match focals[..] {
-        [(least, short), .., (most, long)] => vec![Diagnosis::OwnFocals {
+        [(shortest, short), .., (longest, long)] => vec![Diagnosis::OwnFocals {
             ends: [short, long],
-            ratio: most / least,
+            ratio: longest / shortest,
         }],
         _ => Vec::new(),
     }
 }
 
 /// Photographs whose principal point the mapper found away from the centre.
-pub(super) fn cut(evidence: &Evidence) -> Vec<Diagnosis> {
+pub(super) fn cropped(evidence: &Evidence) -> Vec<Diagnosis> {
     let Some(model) = evidence.model() else {
         return Vec::new();
     };
-    let off = |photo: usize| {
+    let principal_offset = |photo: usize| {
         let camera = model.cameras[evidence.photos[photo].group].as_ref()?;
-        let is_told = evidence.photos[photo].camera.is_some();
-        (!is_told && model.poses[photo].is_some()).then(|| (camera.principal_offset(), camera.long_side()))
+        let is_known = evidence.photos[photo].camera.is_some();
+        (!is_known && model.poses[photo].is_some()).then(|| (camera.principal_offset(), camera.long_side()))
     };
-    let all = (0..evidence.photos.len()).filter_map(|photo| Some((photo, off(photo)?)));
-    let mut cut: Vec<(f64, usize)> = all
-        .filter(|(_, (distance, long_side))| distance > &(BESIDE * long_side))
+    let all = (0..evidence.photos.len()).filter_map(|photo| Some((photo, principal_offset(photo)?)));
+    let mut cropped: Vec<(f64, usize)> = all
+        .filter(|(_, (distance, long_side))| distance > &(MIN_PRINCIPAL_OFFSET * long_side))
         .map(|(photo, (distance, _))| (distance, photo))
         .collect();
-    cut.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
-    match cut.first() {
-        Some((distance, _)) => vec![Diagnosis::Cut {
+    cropped.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+    match cropped.first() {
+        Some((distance, _)) => vec![Diagnosis::Cropped {
             distance: *distance,
-            photos: cut.iter().map(|c| c.1).collect(),
+            photos: cropped.iter().map(|c| c.1).collect(),
         }],
         None => Vec::new(),
     }
@@ -107,13 +107,14 @@ pub(super) fn focal_unknown(evidence: &Evidence) -> Vec<Diagnosis> {
                 .filter(|pair| pair.photos.iter().all(|p| of_group(*p as usize)))
         };
         let general = pairs().filter(|pair| pair.kind == PairKind::General).count();
-        let open = *source == Source::Guess && (general as f64) < GENERAL * pairs().count() as f64;
+        let is_undetermined =
+            *source == FocalSource::Guess && (general as f64) < MIN_GENERAL_FRACTION * pairs().count() as f64;
         // Many photographs of a scene with depth together may determine what single pairs leave open.
         let determined = || {
             let model = evidence.model().filter(|model| model.cameras[group].is_some());
             model.is_some_and(|model| determines_focal(evidence.photos, evidence.features, model, group))
         };
-        if photos.len() > 2 && (held || open && !determined()) {
+        if photos.len() > 2 && (held || is_undetermined && !determined()) {
             found.push(Diagnosis::FocalUnknown { photos });
         }
     }

@@ -4,27 +4,29 @@
 //! of its family; thresholds are constants beside it, measured by the example `doctor` on damaged and on clean captures.
 
 mod appearance;
-mod folds;
+mod consistency;
 mod lens;
-mod looks;
 mod missing;
 mod motion;
 mod moving;
 mod overlap;
+mod quality;
 mod ring;
+mod rotation_averaging;
 mod shots;
-mod turns;
 mod types;
 
 pub use appearance::Appearance;
-pub use folds::{Consistency, consistency};
+pub use consistency::{Consistency, consistency};
+pub use rotation_averaging::{GlobalRotations, average_rotations};
 pub use shots::{Shot, shots};
-pub use turns::{Turns, turns};
 pub use types::{Diagnosis, Kind};
 
 use crate::geometry::camera::DCamera;
-use crate::map::{Absent, LeftOut, Model, PairKind, PhotoInfo, Reason, Source, StandsStill, VerifiedPair, Zoom, rigs};
-use crate::{Features, PairMatches, connected};
+use crate::map::{
+    FocalSource, LeftOut, MissingMatches, Model, PairKind, PhotoInfo, Reason, StillRegion, VerifiedPair, Zoom, rigs,
+};
+use crate::{Features, PairMatches, connected_components};
 use std::collections::BTreeMap;
 
 /// Everything that is known about a capture. All lists by photograph have the same order.
@@ -41,11 +43,11 @@ pub struct Evidence<'a> {
     /// Pairs before verification.
     pub matches: &'a [PairMatches],
     /// What stood still before it was masked, if it was; `features` and `matches` are then without it.
-    pub masked: Option<&'a StandsStill>,
+    pub masked: Option<&'a StillRegion>,
     /// Pairs after verification.
     pub pairs: &'a [VerifiedPair],
     /// `[groups]` the camera of each group before any adjustment, and where its focal length comes from.
-    pub cameras: &'a [(DCamera, Source)],
+    pub cameras: &'a [(DCamera, FocalSource)],
     /// The models, largest first, if the photographs were mapped.
     pub models: &'a [Model],
     /// Focal lengths that are not in the metadata and that the mapper found.
@@ -53,9 +55,9 @@ pub struct Evidence<'a> {
     /// Whether the mapper gave each photograph its own camera.
     pub own_focals: bool,
     /// Photographs that should share points of a model and do not.
-    pub absent: &'a [Absent],
-    /// Number of models into which the mapper split the first model because of absent pairs, if it did.
-    pub apart: Option<usize>,
+    pub missing: &'a [MissingMatches],
+    /// Number of models into which the mapper split the first model because of missing matches, if it did.
+    pub split_models: Option<usize>,
     /// Photographs without a pose and the reasons, if the photographs were mapped.
     pub left_out: &'a [LeftOut],
 }
@@ -77,17 +79,17 @@ struct Graph {
 
 /// Minimum number of matches of a pair that connects photographs. COLMAP accepts 15, but among thousands of pairs chance alone reaches
 /// up to 20.
-const HOLDS: usize = 25;
+const MIN_LINK_MATCHES: usize = 25;
 
 impl Graph {
-    /// The graph of all pairs with at least `matches` matches.
-    fn new(evidence: &Evidence, matches: usize) -> Self {
+    /// The graph of all pairs with at least `min_matches` matches.
+    fn new(evidence: &Evidence, min_matches: usize) -> Self {
         let pairs = evidence.pairs;
         let mut partners = vec![Vec::new(); evidence.photos.len()];
         for (i, pair) in pairs
             .iter()
             .enumerate()
-            .filter(|(_, pair)| pair.matches.len() >= matches)
+            .filter(|(_, pair)| pair.matches.len() >= min_matches)
         {
             let [a, b] = pair.photos.map(|p| p as usize);
             partners[a].push((b, i));
@@ -112,8 +114,8 @@ impl Graph {
     }
 
     /// Photographs in connected parts, largest first.
-    fn parts(&self) -> Vec<Vec<usize>> {
-        connected(self.partners.len(), |photo| self.linked(photo))
+    fn components(&self) -> Vec<Vec<usize>> {
+        connected_components(self.partners.len(), |photo| self.linked(photo))
     }
 }
 
@@ -133,25 +135,25 @@ pub fn diagnose(evidence: &Evidence) -> Vec<Diagnosis> {
     if n == 0 {
         return Vec::new();
     }
-    let graph = Graph::new(evidence, HOLDS);
-    let (still, twice) = motion::still(evidence);
-    let (moving, showing) = if still.is_empty() {
+    let graph = Graph::new(evidence, MIN_LINK_MATCHES);
+    let (still, duplicates) = motion::still_and_duplicates(evidence);
+    let (moving, moving_pairs) = if still.is_empty() {
         moving::moving(evidence)
     } else {
         Default::default()
     };
-    let rotation_only = motion::rotation_only(evidence, &graph, &showing);
-    let looks = [
-        looks::blurred(evidence, &graph),
-        looks::exposure(evidence, &graph),
-        looks::few_features(evidence, &graph),
+    let rotation_only = motion::rotation_only(evidence, &graph, &moving_pairs);
+    let quality = [
+        quality::blurred(evidence, &graph),
+        quality::exposure(evidence, &graph),
+        quality::few_features(evidence, &graph),
     ]
     .concat();
     let lens = [
         lens::settings(evidence),
         lens::zoom(evidence),
         lens::own_focals(evidence),
-        lens::cut(evidence),
+        lens::cropped(evidence),
         lens::focal_unknown(evidence),
     ]
     .concat();
@@ -160,25 +162,26 @@ pub fn diagnose(evidence: &Evidence) -> Vec<Diagnosis> {
         Some(_) => ring::ring(evidence, &graph, &[]),
         None => {
             let found = consistency(evidence.photos, evidence.features, evidence.cameras, evidence.pairs);
-            match found.is_settled() {
-                true => ring::ring(evidence, &graph, &found.turns.world_from_camera),
+            match found.is_consistent() {
+                true => ring::ring(evidence, &graph, &found.rotations.world_from_camera),
                 false => Vec::new(),
             }
         }
     };
-    let contradiction = folds::contradiction(evidence, &moving.iter().flat_map(Diagnosis::photos).collect::<Vec<_>>());
+    let contradiction =
+        consistency::contradiction(evidence, &moving.iter().flat_map(Diagnosis::photos).collect::<Vec<_>>());
     let known = [
         contradiction,
         missing::missing(evidence),
         rotation_only,
-        motion::turn_only(evidence),
+        motion::rotation_between_models(evidence),
         still,
         overlap,
         ring,
         lens,
-        looks,
+        quality,
         moving,
-        twice,
+        duplicates,
     ]
     .concat();
     let left_out = left_out(evidence, &known);
@@ -227,6 +230,6 @@ fn left_out(evidence: &Evidence, known: &[Diagnosis]) -> Vec<Diagnosis> {
 }
 
 /// Whether the pair is a turn on the spot.
-fn turns_only(pair: &VerifiedPair) -> bool {
+fn is_pure_rotation(pair: &VerifiedPair) -> bool {
     pair.kind == PairKind::Rotation
 }

@@ -5,7 +5,7 @@
 //! looks similar where a motif is mistaken for its copy, but seldom between photographs that share most, and a third photograph
 //! that shows both motifs tells them apart: a moving object is the same object in all three.
 
-use super::motion::most_named;
+use super::motion::photos_by_pair_count;
 use super::{Diagnosis, Evidence};
 use crate::PairMatches;
 use crate::geometry::correspondences::{Correspondences, sampson_squared};
@@ -13,36 +13,36 @@ use crate::geometry::essential::cross_matrix;
 use crate::geometry::fundamental::Fundamental;
 use crate::geometry::homography::Homography;
 use crate::geometry::ransac::estimate;
-use crate::map::{AGREES, centered_points, limits, showing};
+use crate::map::{MAX_INLIER_ERROR, centered_points, pairs_with_value, ransac_limits};
 use crate::median;
 use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
 /// Number of partners with which each photograph is compared, those with most matches.
-const STRONGEST: usize = 5;
+const MAX_PARTNERS: usize = 5;
 /// Minimum number of matches on what moves, and on the scene.
-const MATCHES: usize = 12;
-const SCENE_MATCHES: usize = 15;
+const MIN_OBJECT_MATCHES: usize = 12;
+const MIN_SCENE_MATCHES: usize = 15;
 /// Minimum fraction of the other matches that are on the scene.
-const SCENE_FRACTION: f64 = 0.4;
+const MIN_SCENE_FRACTION: f64 = 0.4;
 /// Number of planes that are tried for a pair.
-const PLANES: usize = 3;
+const MAX_PLANES: usize = 3;
 /// Minimum median distance of what moves from the scene's epipolar lines, relative to the long side.
-const OFF: f64 = 0.012;
+const MIN_EPIPOLAR_DISTANCE: f64 = 0.012;
 /// Maximum extent of what moves along each axis, relative to the long side.
-const PART: f64 = 0.5;
+const MAX_OBJECT_EXTENT: f64 = 0.5;
 /// A group in front of a plane is parallax: number of its matches whose lines of parallax are tried, and minimum fractions of the
 /// group's matches and of the scene's that one motion explains.
-const PARALLAX_LINES: usize = 20;
-const EXPLAINED: f64 = 0.5;
-const AS_MANY: f64 = 0.9;
+const MAX_PARALLAX_LINES: usize = 20;
+const MIN_GROUP_FRACTION: f64 = 0.5;
+const MIN_SCENE_RATIO: f64 = 0.9;
 /// Minimum fraction of matches in third photographs that confirm a single object.
-const ONE_THING: f64 = 0.8;
+const MIN_CONFIRMED_FRACTION: f64 = 0.8;
 /// Minimum number of pairs, and minimum fraction of the compared ones, for a diagnosis. Four captures with a moving board reach 0.22
 /// to 0.76, clean ones 0.1 (in front of wallpaper) or less.
-const PAIRS: usize = 4;
-const FRACTION: f64 = 0.15;
+const MIN_PAIRS: usize = 4;
+const MIN_PAIR_FRACTION: f64 = 0.15;
 
 /// The partners of each keypoint: `[photos][keypoints]` photograph and keypoint, ascending.
 type Partners = Vec<Vec<Vec<[u32; 2]>>>;
@@ -52,22 +52,22 @@ type Match = ([u32; 2], [DVec2; 2]);
 
 /// What moves, and the pairs that show it.
 pub(super) fn moving(evidence: &Evidence) -> (Vec<Diagnosis>, Vec<[u32; 2]>) {
-    let compared = strongest(evidence);
+    let compared = strongest_pairs(evidence);
     let partners = partners(evidence);
     let counts: Vec<Option<usize>> = compared
         .par_iter()
         .map(|pair| {
-            let group = own_motion(evidence, pair)?;
-            is_one_thing(&partners, pair.photos, &group).then_some(group.len())
+            let group = moving_group(evidence, pair)?;
+            is_single_object(&partners, pair.photos, &group).then_some(group.len())
         })
         .collect();
-    let found = showing(&compared, &counts);
-    if found.len() < PAIRS || (found.len() as f64) < FRACTION * compared.len() as f64 {
+    let found = pairs_with_value(&compared, &counts);
+    if found.len() < MIN_PAIRS || (found.len() as f64) < MIN_PAIR_FRACTION * compared.len() as f64 {
         return (Vec::new(), Vec::new());
     }
     let matches = median(counts.into_iter().flatten().map(|count| count as f64).collect());
     let diagnosis = Diagnosis::Moving {
-        photos: most_named(&found),
+        photos: photos_by_pair_count(&found),
         pairs: [found.len(), compared.len()],
         matches: matches.unwrap_or(0.0) as usize,
     };
@@ -75,29 +75,29 @@ pub(super) fn moving(evidence: &Evidence) -> (Vec<Diagnosis>, Vec<[u32; 2]>) {
 }
 
 /// The pairs with most matches of each photograph, most matches first.
-fn strongest<'a>(evidence: &Evidence<'a>) -> Vec<&'a PairMatches> {
+fn strongest_pairs<'a>(evidence: &Evidence<'a>) -> Vec<&'a PairMatches> {
     let mut order: Vec<&PairMatches> = evidence.matches.iter().collect();
-    order.retain(|pair| pair.matches.len() >= MATCHES + SCENE_MATCHES);
+    order.retain(|pair| pair.matches.len() >= MIN_OBJECT_MATCHES + MIN_SCENE_MATCHES);
     order.sort_by_key(|pair| (std::cmp::Reverse(pair.matches.len()), pair.photos));
     let mut count = vec![0; evidence.photos.len()];
     order.retain(|pair| {
         let ends = pair.photos.map(|p| p as usize);
         ends.iter().for_each(|p| count[*p] += 1);
-        ends.iter().any(|p| count[*p] <= STRONGEST)
+        ends.iter().any(|p| count[*p] <= MAX_PARTNERS)
     });
     order
 }
 
 /// Matches on a compact object that agree with one another and not with the scene.
-fn own_motion(evidence: &Evidence, pair: &PairMatches) -> Option<Vec<[u32; 2]>> {
-    let places = centered_points(evidence.photos, evidence.features, pair);
-    let mut rest: Vec<Match> = pair.matches.iter().copied().zip(places).collect();
+fn moving_group(evidence: &Evidence, pair: &PairMatches) -> Option<Vec<[u32; 2]>> {
+    let positions = centered_points(evidence.photos, evidence.features, pair);
+    let mut rest: Vec<Match> = pair.matches.iter().copied().zip(positions).collect();
     let mut others: Vec<Match> = Vec::new();
-    for _ in 0..PLANES {
-        let (group, left) = plane(pair, rest)?;
+    for _ in 0..MAX_PLANES {
+        let (group, left) = fit_plane(pair, rest)?;
         if is_compact(&group) {
             let scene: Vec<Match> = [&others[..], &left[..]].concat();
-            if is_off(pair, &group, &scene) {
+            if disagrees_with_scene(pair, &group, &scene) {
                 return Some(keypoints(group));
             }
         }
@@ -108,23 +108,23 @@ fn own_motion(evidence: &Evidence, pair: &PairMatches) -> Option<Vec<[u32; 2]>> 
 }
 
 /// Whether `group` disagrees with the motion of `scene`, provided that `scene` has one and it covers most of the photographs.
-fn is_off(pair: &PairMatches, group: &[Match], scene: &[Match]) -> bool {
+fn disagrees_with_scene(pair: &PairMatches, group: &[Match], scene: &[Match]) -> bool {
     let points = Correspondences::new(scene.iter().map(|m| m.1).collect());
     let problem = Fundamental {
         points: &points,
-        threshold: AGREES,
+        threshold: MAX_INLIER_ERROR,
     };
-    let Some(found) = estimate(&problem, Vec::new(), limits(pair, 300)) else {
+    let Some(found) = estimate(&problem, Vec::new(), ransac_limits(pair, 300)) else {
         return false;
     };
-    let agrees = |m: &&Match| sampson_squared(&found.model, m.1) < AGREES * AGREES;
-    let spread: Vec<Match> = scene.iter().filter(agrees).copied().collect();
-    let enough = spread.len() >= SCENE_MATCHES && spread.len() as f64 >= SCENE_FRACTION * scene.len() as f64;
+    let agrees = |m: &&Match| sampson_squared(&found.model, m.1) < MAX_INLIER_ERROR * MAX_INLIER_ERROR;
+    let inliers: Vec<Match> = scene.iter().filter(agrees).copied().collect();
+    let enough = inliers.len() >= MIN_SCENE_MATCHES && inliers.len() as f64 >= MIN_SCENE_FRACTION * scene.len() as f64;
     let distances = group.iter().map(|m| sampson_squared(&found.model, m.1).sqrt());
     enough
-        && !is_compact(&spread)
-        && median(distances.collect()).is_some_and(|distance| distance > OFF)
-        && !is_parallax(pair, group, scene, spread.len())
+        && !is_compact(&inliers)
+        && median(distances.collect()).is_some_and(|distance| distance > MIN_EPIPOLAR_DISTANCE)
+        && !is_parallax(pair, group, scene, inliers.len())
 }
 
 /// Whether another motion explains `group` and nearly as many matches of `scene` as the one that explains `agreeing` of them. That is
@@ -134,27 +134,27 @@ fn is_parallax(pair: &PairMatches, group: &[Match], scene: &[Match], agreeing: u
     let points = Correspondences::new(scene.iter().map(|m| m.1).collect());
     let problem = Homography {
         points: &points,
-        threshold: AGREES,
+        threshold: MAX_INLIER_ERROR,
     };
-    let Some(found) = estimate(&problem, Vec::new(), limits(pair, 500)) else {
+    let Some(found) = estimate(&problem, Vec::new(), ransac_limits(pair, 500)) else {
         return false;
     };
     let plane = found.model;
     // The lines along which points leave the plane meet in the epipole.
     let lines: Vec<DVec3> = group
         .iter()
-        .step_by(group.len().div_ceil(PARALLAX_LINES))
+        .step_by(group.len().div_ceil(MAX_PARALLAX_LINES))
         .map(|(_, [a, b])| (plane * a.extend(1.0)).cross(b.extend(1.0)))
         .collect();
     let agree = |f: &DMat3, matches: &[Match]| {
-        let agrees = |m: &&Match| sampson_squared(f, m.1) < AGREES * AGREES;
+        let agrees = |m: &&Match| sampson_squared(f, m.1) < MAX_INLIER_ERROR * MAX_INLIER_ERROR;
         matches.iter().filter(agrees).count() as f64
     };
     let pairs = (0..lines.len()).flat_map(|i| (0..i).map(move |j| [i, j]));
     pairs
         .map(|[i, j]| cross_matrix(lines[i].cross(lines[j])) * plane)
-        .filter(|f| agree(f, group) >= EXPLAINED * group.len() as f64)
-        .any(|f| agree(&f, scene) >= AS_MANY * agreeing as f64)
+        .filter(|f| agree(f, group) >= MIN_GROUP_FRACTION * group.len() as f64)
+        .any(|f| agree(&f, scene) >= MIN_SCENE_RATIO * agreeing as f64)
 }
 
 fn keypoints(matches: Vec<Match>) -> Vec<[u32; 2]> {
@@ -162,22 +162,22 @@ fn keypoints(matches: Vec<Match>) -> Vec<[u32; 2]> {
 }
 
 /// The matches that agree with one plane, and the others; `None` if too few agree.
-fn plane(pair: &PairMatches, matches: Vec<Match>) -> Option<(Vec<Match>, Vec<Match>)> {
-    if matches.len() < MATCHES {
+fn fit_plane(pair: &PairMatches, matches: Vec<Match>) -> Option<(Vec<Match>, Vec<Match>)> {
+    if matches.len() < MIN_OBJECT_MATCHES {
         return None;
     }
     let points = Correspondences::new(matches.iter().map(|m| m.1).collect());
     let problem = Homography {
         points: &points,
-        threshold: AGREES,
+        threshold: MAX_INLIER_ERROR,
     };
-    let found = estimate(&problem, Vec::new(), limits(pair, 500))?;
+    let found = estimate(&problem, Vec::new(), ransac_limits(pair, 500))?;
     let agrees = |m: &Match| {
         let mapped = found.model * m.1[0].extend(1.0);
-        (mapped.truncate() / mapped.z - m.1[1]).length() < AGREES
+        (mapped.truncate() / mapped.z - m.1[1]).length() < MAX_INLIER_ERROR
     };
     let (group, left): (Vec<Match>, Vec<Match>) = matches.into_iter().partition(agrees);
-    (group.len() >= MATCHES).then_some((group, left))
+    (group.len() >= MIN_OBJECT_MATCHES).then_some((group, left))
 }
 
 /// Whether matches cover a small part of both photographs, but more than a point.
@@ -188,7 +188,7 @@ fn is_compact(matches: &[Match]) -> bool {
         // Up to a tenth on either side may be outliers.
         let cut = values.len() / 10;
         let width = values[values.len() - 1 - cut] - values[cut];
-        (0.005..PART).contains(&width)
+        (0.005..MAX_OBJECT_EXTENT).contains(&width)
     };
     [0, 1].iter().all(|side| within(*side, 0) && within(*side, 1))
 }
@@ -214,7 +214,7 @@ fn partners(evidence: &Evidence) -> Partners {
 }
 
 /// Whether third photographs that match both keypoints of these matches do so at the same keypoint.
-fn is_one_thing(partners: &Partners, [a, b]: [u32; 2], matches: &[[u32; 2]]) -> bool {
+fn is_single_object(partners: &Partners, [a, b]: [u32; 2], matches: &[[u32; 2]]) -> bool {
     let (mut same, mut both) = (0, 0);
     for [i, j] in matches {
         let of_b: BTreeMap<u32, u32> = partners[b as usize][*j as usize]
@@ -228,5 +228,5 @@ fn is_one_thing(partners: &Partners, [a, b]: [u32; 2], matches: &[[u32; 2]]) -> 
             }
         }
     }
-    both >= matches.len() && same as f64 >= ONE_THING * both as f64
+    both >= matches.len() && same as f64 >= MIN_CONFIRMED_FRACTION * both as f64
 }

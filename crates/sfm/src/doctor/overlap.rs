@@ -3,11 +3,11 @@
 use super::{Diagnosis, Evidence, Graph};
 
 /// Minimum number of partners for a photograph to be well connected.
-const PARTNERS: usize = 3;
+const MIN_PARTNERS: usize = 3;
 /// Minimum number of photographs of a capture whose photographs can be expected to overlap more than once.
-const CAPTURE: usize = 6;
+const MIN_CAPTURE_PHOTOS: usize = 6;
 /// Minimum number of photographs of a part: fewer are reported as photographs with few partners.
-const PART: usize = 3;
+const MIN_PART_PHOTOS: usize = 3;
 
 /// All diagnoses about the graph of overlap.
 pub(super) fn overlap(evidence: &Evidence, graph: &Graph) -> Vec<Diagnosis> {
@@ -16,11 +16,15 @@ pub(super) fn overlap(evidence: &Evidence, graph: &Graph) -> Vec<Diagnosis> {
     if n < 2 {
         return found;
     }
-    let parts: Vec<Vec<usize>> = graph.parts().into_iter().filter(|part| part.len() >= PART).collect();
+    let parts: Vec<Vec<usize>> = graph
+        .components()
+        .into_iter()
+        .filter(|part| part.len() >= MIN_PART_PHOTOS)
+        .collect();
     if parts.len() > 1 {
         found.push(Diagnosis::SeparateParts { parts });
     }
-    if n < CAPTURE {
+    if n < MIN_CAPTURE_PHOTOS {
         return found;
     }
     // The faces of panoramas link the panoramas, so single pairs of faces would look like bridges.
@@ -29,61 +33,61 @@ pub(super) fn overlap(evidence: &Evidence, graph: &Graph) -> Vec<Diagnosis> {
     }
     for photo in 0..n {
         let partners: Vec<usize> = graph.partners[photo].iter().map(|p| p.0).collect();
-        if partners.len() < PARTNERS && !graph.is_on_rig(photo) {
+        if partners.len() < MIN_PARTNERS && !graph.is_on_rig(photo) {
             found.push(Diagnosis::FewPartners { photo, partners });
         }
     }
     found
 }
 
-/// Bridges and cut points (Tarjan 1972), where each side has at least [`PART`] photographs.
+/// Bridges and cut points (Tarjan 1972), where each side has at least [`MIN_PART_PHOTOS`] photographs.
 fn weak_links(graph: &Graph) -> Vec<Diagnosis> {
     let n = graph.partners.len();
     let mut found = Vec::new();
-    for part in graph.parts() {
-        let size = part.len();
-        let mut search = Search {
+    for component in graph.components() {
+        let size = component.len();
+        let mut search = DepthFirstSearch {
             graph,
             order: vec![usize::MAX; n],
             low: vec![usize::MAX; n],
-            below: vec![1; n],
+            subtree_sizes: vec![1; n],
             members: Vec::new(),
         };
-        search.visit(part[0], &mut |search, parent, child| {
-            let (behind, rest) = (search.below[child], size - search.below[child]);
-            if search.low[child] > search.order[parent] && behind >= PART && rest >= PART {
+        search.visit(component[0], &mut |search, parent, child| {
+            let (behind, rest) = (search.subtree_sizes[child], size - search.subtree_sizes[child]);
+            if search.low[child] > search.order[parent] && behind >= MIN_PART_PHOTOS && rest >= MIN_PART_PHOTOS {
                 found.push(Diagnosis::Bridge {
                     photos: [parent.min(child), parent.max(child)],
                     sides: [rest, behind],
                 });
-            } else if search.low[child] >= search.order[parent] && behind >= PART && rest > PART {
+            } else if search.low[child] >= search.order[parent] && behind >= MIN_PART_PHOTOS && rest > MIN_PART_PHOTOS {
                 // The parent belongs to neither side.
-                let mut behind_it: Vec<usize> = search.members[search.order[child]..].to_vec();
+                let mut smaller_part: Vec<usize> = search.members[search.order[child]..].to_vec();
                 if 2 * behind > size {
-                    behind_it = part
+                    smaller_part = component
                         .iter()
                         .copied()
-                        .filter(|p| *p != parent && !behind_it.contains(p))
+                        .filter(|p| *p != parent && !smaller_part.contains(p))
                         .collect();
                 }
-                behind_it.sort_unstable();
+                smaller_part.sort_unstable();
                 found.push(Diagnosis::CutPoint {
                     photo: parent,
-                    behind: behind_it,
+                    behind: smaller_part,
                 });
             }
         });
     }
     // The ends of a bridge are cut points too, and the root of the search is one for each of its branches.
-    let mut named: Vec<usize> = found
+    let mut reported: Vec<usize> = found
         .iter()
         .filter(|d| matches!(d, Diagnosis::Bridge { .. }))
         .flat_map(Diagnosis::photos)
         .collect();
     found.retain(|diagnosis| match diagnosis {
-        Diagnosis::CutPoint { photo, .. } if named.contains(photo) => false,
+        Diagnosis::CutPoint { photo, .. } if reported.contains(photo) => false,
         Diagnosis::CutPoint { photo, .. } => {
-            named.push(*photo);
+            reported.push(*photo);
             true
         }
         _ => true,
@@ -92,21 +96,21 @@ fn weak_links(graph: &Graph) -> Vec<Diagnosis> {
 }
 
 /// Depth-first search.
-struct Search<'a> {
+struct DepthFirstSearch<'a> {
     graph: &'a Graph,
     /// `[photos]` position of each in the order in which they were reached.
     order: Vec<usize>,
     /// `[photos]` the earliest photograph that each and those below it lead to.
     low: Vec<usize>,
     /// `[photos]` number of photographs below each, including itself.
-    below: Vec<usize>,
+    subtree_sizes: Vec<usize>,
     /// Photographs in the order in which they were reached.
     members: Vec<usize>,
 }
 
-impl Search<'_> {
-    /// Calls `done(search, parent, child)` when everything below `child` has been visited.
-    fn visit(&mut self, root: usize, done: &mut dyn FnMut(&Self, usize, usize)) {
+impl DepthFirstSearch<'_> {
+    /// Calls `on_visited(search, parent, child)` when everything below `child` has been visited.
+    fn visit(&mut self, root: usize, on_visited: &mut dyn FnMut(&Self, usize, usize)) {
         // The photograph, its parent, and its next partner.
         let mut stack = vec![(root, usize::MAX, 0)];
         while let Some((photo, parent, next)) = stack.last_mut() {
@@ -128,8 +132,8 @@ impl Search<'_> {
             stack.pop();
             if parent != usize::MAX {
                 self.low[parent] = self.low[parent].min(self.low[photo]);
-                self.below[parent] += self.below[photo];
-                done(self, parent, photo);
+                self.subtree_sizes[parent] += self.subtree_sizes[photo];
+                on_visited(self, parent, photo);
             }
         }
     }
@@ -194,7 +198,7 @@ mod tests {
 
     #[test]
     fn parts_are_listed_largest_first() {
-        let parts = graph(6, &[[0, 5], [1, 2], [2, 3]]).parts();
+        let parts = graph(6, &[[0, 5], [1, 2], [2, 3]]).components();
         assert_eq!(parts, [vec![1, 2, 3], vec![0, 5], vec![4]]);
     }
 }

@@ -6,11 +6,11 @@ use crate::map::Model;
 use glam::{DQuat, DVec3};
 
 /// Angle between neighbouring photographs around a scene at which they match well, degrees.
-const STEP: f64 = 15.0;
+const MAX_STEP_DEGREES: f64 = 15.0;
 /// Maximum number of photographs for one fault.
-const MOST: usize = 8;
+const MAX_SHOTS: usize = 8;
 /// Minimum angle between two cameras, seen from the centre of the model, at which the path between them is an arc around it, degrees.
-const ARC: f64 = 10.0;
+const MIN_ARC_DEGREES: f64 = 10.0;
 
 /// The pose of a photograph to be taken.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -23,7 +23,7 @@ pub struct Shot {
 
 /// Photographs that would repair a fault between two posed photographs, from one to the other; none for other faults.
 pub fn shots(diagnosis: &Diagnosis, model: &Model) -> Vec<Shot> {
-    let ([a, b], least) = match diagnosis {
+    let ([a, b], min_shots) = match diagnosis {
         Diagnosis::Gap { sides: ends, .. } | Diagnosis::OpenLoop { ends, .. } => (*ends, 1),
         Diagnosis::Bridge { photos, .. } => (*photos, 2),
         Diagnosis::CutPoint { .. } | Diagnosis::FewPartners { .. } => match diagnosis.sides() {
@@ -33,31 +33,34 @@ pub fn shots(diagnosis: &Diagnosis, model: &Model) -> Vec<Shot> {
         _ => return Vec::new(),
     };
     match (model.poses[a], model.poses[b]) {
-        (Some(a), Some(b)) => between(&a, &b, least),
+        (Some(a), Some(b)) => shots_between(&a, &b, min_shots),
         _ => Vec::new(),
     }
 }
 
 /// Poses between two, on an arc around the vertical axis through the centre of the model where both are on different sides of it.
-fn between(a: &DPose, b: &DPose, least: usize) -> Vec<Shot> {
+fn shots_between(a: &DPose, b: &DPose, min_shots: usize) -> Vec<Shot> {
     let azimuth = |p: DVec3| p.y.atan2(p.x);
-    let turn = (azimuth(b.position) - azimuth(a.position) + std::f64::consts::PI).rem_euclid(std::f64::consts::TAU)
+    let azimuth_difference = (azimuth(b.position) - azimuth(a.position) + std::f64::consts::PI)
+        .rem_euclid(std::f64::consts::TAU)
         - std::f64::consts::PI;
     let forward = [a, b].map(|pose| pose.rotation * DVec3::Z);
-    let apart = forward[0]
+    let angle_degrees = forward[0]
         .angle_between(forward[1])
         .to_degrees()
-        .max(turn.to_degrees().abs());
-    let count = ((apart / STEP).ceil() as usize).saturating_sub(1).clamp(least, MOST);
+        .max(azimuth_difference.to_degrees().abs());
+    let count = ((angle_degrees / MAX_STEP_DEGREES).ceil() as usize)
+        .saturating_sub(1)
+        .clamp(min_shots, MAX_SHOTS);
     let shot = |i: usize| {
         let t = (i + 1) as f64 / (count + 1) as f64;
         let straight = a.position.lerp(b.position, t);
-        let position = if turn.to_degrees().abs() < ARC {
+        let position = if azimuth_difference.to_degrees().abs() < MIN_ARC_DEGREES {
             straight
         } else {
             let radius = |p: DVec3| p.truncate().length();
             let radius = radius(a.position) * (1.0 - t) + radius(b.position) * t;
-            let (sin, cos) = (azimuth(a.position) + t * turn).sin_cos();
+            let (sin, cos) = (azimuth(a.position) + t * azimuth_difference).sin_cos();
             DVec3::new(radius * cos, radius * sin, straight.z)
         };
         let arc = DQuat::from_rotation_arc(forward[0], forward[1]);
@@ -101,6 +104,6 @@ mod tests {
             degrees: 60.0,
         };
         assert!(shots(&unposed, &model).is_empty());
-        assert!(shots(&Diagnosis::Twice { photos: [0, 1] }, &model).is_empty());
+        assert!(shots(&Diagnosis::Duplicate { photos: [0, 1] }, &model).is_empty());
     }
 }

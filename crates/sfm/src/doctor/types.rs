@@ -1,10 +1,10 @@
 //! The doctor's diagnoses: one variant for each, with its evidence and one sentence.
 
-use super::looks::FEATURES_BY_MEDIAN;
+use super::quality::MIN_FEATURE_RATIO;
 use std::fmt::{self, Display, Formatter};
 
 /// Minimum fraction of matches at rest for the camera itself to be at rest: people who walk in front of a camera on a tripod leave 98 %.
-const CAMERA_AT_REST: f64 = 0.9;
+const MIN_STILL_CAMERA_FRACTION: f64 = 0.9;
 
 /// The family of a diagnosis; tests and reports count diagnoses by family.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -19,8 +19,8 @@ pub enum Kind {
     Hidden,
     /// [`Diagnosis::Zoom`], [`Diagnosis::OwnFocals`] and [`Diagnosis::ZoomSettings`]
     Zoom,
-    /// [`Diagnosis::Cut`]
-    Cut,
+    /// [`Diagnosis::Cropped`]
+    Cropped,
     /// [`Diagnosis::FocalUnknown`]
     FocalUnknown,
     /// [`Diagnosis::SeparateParts`]
@@ -33,14 +33,14 @@ pub enum Kind {
     Gap,
     /// [`Diagnosis::OpenLoop`]
     OpenLoop,
-    /// [`Diagnosis::RotationOnly`] and [`Diagnosis::TurnOnly`]
+    /// [`Diagnosis::RotationOnly`] and [`Diagnosis::RotationBetweenModels`]
     RotationOnly,
-    /// [`Diagnosis::StandsStill`]
-    StandsStill,
+    /// [`Diagnosis::StillRegion`]
+    StillRegion,
     /// [`Diagnosis::Moving`]
     Moving,
-    /// [`Diagnosis::Twice`]
-    Twice,
+    /// [`Diagnosis::Duplicate`]
+    Duplicate,
     /// [`Diagnosis::Contradiction`]
     Contradiction,
     /// [`Diagnosis::Missing`]
@@ -58,7 +58,7 @@ impl Kind {
             Kind::FewFeatures => "few-features",
             Kind::Hidden => "hidden",
             Kind::Zoom => "zoom",
-            Kind::Cut => "cut",
+            Kind::Cropped => "cut",
             Kind::FocalUnknown => "focal-unknown",
             Kind::SeparateParts => "separate-parts",
             Kind::WeakLink => "weak-link",
@@ -66,9 +66,9 @@ impl Kind {
             Kind::Gap => "gap",
             Kind::OpenLoop => "open-loop",
             Kind::RotationOnly => "rotation-only",
-            Kind::StandsStill => "stands-still",
+            Kind::StillRegion => "stands-still",
             Kind::Moving => "moving",
-            Kind::Twice => "twice",
+            Kind::Duplicate => "twice",
             Kind::Contradiction => "contradiction",
             Kind::Missing => "missing-matches",
             Kind::LeftOut => "left-out",
@@ -142,7 +142,7 @@ pub enum Diagnosis {
         settings: Vec<(f64, Vec<usize>)>,
     },
     /// The principal point is away from the centre.
-    Cut {
+    Cropped {
         /// The photographs, those with the largest distance first.
         photos: Vec<usize>,
         /// The largest distance, px.
@@ -201,14 +201,14 @@ pub enum Diagnosis {
         pairs: usize,
     },
     /// Two models show the same part of the scene, but from one place.
-    TurnOnly {
+    RotationBetweenModels {
         /// The photographs, one of each model, with most matches.
         ends: [usize; 2],
         /// Number of photographs of each model.
         sides: [usize; 2],
     },
     /// A part of the photographs stands still while the rest moves.
-    StandsStill {
+    StillRegion {
         /// Photographs of such pairs.
         photos: Vec<usize>,
         /// Number of such pairs, and of all pairs that were compared.
@@ -228,7 +228,7 @@ pub enum Diagnosis {
         matches: usize,
     },
     /// Two photographs of the same part of the scene from the same place.
-    Twice {
+    Duplicate {
         /// The photographs.
         photos: [usize; 2],
     },
@@ -239,9 +239,9 @@ pub enum Diagnosis {
         /// Matches of the first.
         matches: usize,
         /// The fraction of them that agrees with the rest.
-        agree: f64,
+        agreement: f64,
         /// Number of verified pairs whose photographs are in the model.
-        of: usize,
+        total: usize,
     },
     /// Photographs without a match to others from nearly the same place.
     Missing {
@@ -272,17 +272,17 @@ impl Diagnosis {
             Diagnosis::FewFeatures { .. } => Kind::FewFeatures,
             Diagnosis::Hidden { .. } => Kind::Hidden,
             Diagnosis::Zoom { .. } | Diagnosis::OwnFocals { .. } | Diagnosis::ZoomSettings { .. } => Kind::Zoom,
-            Diagnosis::Cut { .. } => Kind::Cut,
+            Diagnosis::Cropped { .. } => Kind::Cropped,
             Diagnosis::FocalUnknown { .. } => Kind::FocalUnknown,
             Diagnosis::SeparateParts { .. } => Kind::SeparateParts,
             Diagnosis::Bridge { .. } | Diagnosis::CutPoint { .. } => Kind::WeakLink,
             Diagnosis::FewPartners { .. } => Kind::FewPartners,
             Diagnosis::Gap { .. } => Kind::Gap,
             Diagnosis::OpenLoop { .. } => Kind::OpenLoop,
-            Diagnosis::RotationOnly { .. } | Diagnosis::TurnOnly { .. } => Kind::RotationOnly,
-            Diagnosis::StandsStill { .. } => Kind::StandsStill,
+            Diagnosis::RotationOnly { .. } | Diagnosis::RotationBetweenModels { .. } => Kind::RotationOnly,
+            Diagnosis::StillRegion { .. } => Kind::StillRegion,
             Diagnosis::Moving { .. } => Kind::Moving,
-            Diagnosis::Twice { .. } => Kind::Twice,
+            Diagnosis::Duplicate { .. } => Kind::Duplicate,
             Diagnosis::Contradiction { .. } => Kind::Contradiction,
             Diagnosis::Missing { .. } => Kind::Missing,
             Diagnosis::LeftOut { .. } => Kind::LeftOut,
@@ -301,18 +301,18 @@ impl Diagnosis {
             | Diagnosis::FewPartners { photo, .. }
             | Diagnosis::LeftOut { photo, .. } => vec![*photo],
             Diagnosis::Zoom { photos, .. }
-            | Diagnosis::Cut { photos, .. }
+            | Diagnosis::Cropped { photos, .. }
             | Diagnosis::FocalUnknown { photos }
             | Diagnosis::RotationOnly { photos, .. }
-            | Diagnosis::StandsStill { photos, .. }
+            | Diagnosis::StillRegion { photos, .. }
             | Diagnosis::Moving { photos, .. }
             | Diagnosis::Missing { photos, .. } => photos.clone(),
             Diagnosis::ZoomSettings { settings } => settings.iter().flat_map(|s| s.1.clone()).collect(),
             Diagnosis::SeparateParts { parts } => parts.iter().skip(1).flatten().copied().collect(),
-            Diagnosis::Bridge { photos, .. } | Diagnosis::Twice { photos } => photos.to_vec(),
+            Diagnosis::Bridge { photos, .. } | Diagnosis::Duplicate { photos } => photos.to_vec(),
             Diagnosis::Gap { sides: ends, .. }
             | Diagnosis::OpenLoop { ends, .. }
-            | Diagnosis::TurnOnly { ends, .. }
+            | Diagnosis::RotationBetweenModels { ends, .. }
             | Diagnosis::OwnFocals { ends, .. } => ends.to_vec(),
             Diagnosis::Contradiction { pairs, .. } => pairs.iter().flatten().copied().collect(),
         }
@@ -351,13 +351,17 @@ struct Sentence<'a> {
 impl Sentence<'_> {
     /// `a.jpg, b.jpg, c.jpg and 12 others`
     fn list(&self, photos: &[usize]) -> String {
-        const SHOWN: usize = 4;
-        let shown: Vec<&str> = photos.iter().take(SHOWN).map(|p| self.names[*p].as_str()).collect();
+        const MAX_LISTED: usize = 4;
+        let shown: Vec<&str> = photos
+            .iter()
+            .take(MAX_LISTED)
+            .map(|p| self.names[*p].as_str())
+            .collect();
         match photos.len() {
             0 => "none".into(),
-            n if n <= SHOWN => shown.join(", "),
-            n if n == SHOWN + 1 => format!("{} and 1 other", shown.join(", ")),
-            n => format!("{} and {} others", shown.join(", "), n - SHOWN),
+            n if n <= MAX_LISTED => shown.join(", "),
+            n if n == MAX_LISTED + 1 => format!("{} and 1 other", shown.join(", ")),
+            n => format!("{} and {} others", shown.join(", "), n - MAX_LISTED),
         }
     }
 }
@@ -409,7 +413,7 @@ impl Display for Sentence<'_> {
             } => {
                 write!(f, "{} has {features} features", name(photo))?;
                 // Where most photographs have few features, there is nothing to compare with.
-                if (*features as f64) < FEATURES_BY_MEDIAN * *median as f64 {
+                if (*features as f64) < MIN_FEATURE_RATIO * *median as f64 {
                     write!(f, " where half of the photographs have {median} or more")?;
                 }
                 write!(f, ": it shows little texture; include something textured")
@@ -447,7 +451,7 @@ impl Display for Sentence<'_> {
                     settings.join(", ")
                 )
             }
-            Diagnosis::Cut { photos, distance } => write!(
+            Diagnosis::Cropped { photos, distance } => write!(
                 f,
                 "the principal point is up to {distance:.0} px off the centre of {}, as in photographs cropped from larger ones; use them \
                  as the camera took them",
@@ -510,13 +514,13 @@ impl Display for Sentence<'_> {
                 "{} were taken from one place ({pairs} pairs only turn); move sideways between photographs",
                 self.list(photos)
             ),
-            Diagnosis::TurnOnly { ends: [a, b], sides } => write!(
+            Diagnosis::RotationBetweenModels { ends: [a, b], sides } => write!(
                 f,
                 "between {} and {} the camera only turned, so the {} and {} photographs on either side are separate models; move \
                  sideways while turning there",
                 self.names[*a], self.names[*b], sides[0], sides[1]
             ),
-            Diagnosis::StandsStill {
+            Diagnosis::StillRegion {
                 photos,
                 pairs,
                 fraction,
@@ -529,7 +533,7 @@ impl Display for Sentence<'_> {
                 pairs[0],
                 pairs[1],
                 self.list(photos),
-                if *fraction >= CAMERA_AT_REST {
+                if *fraction >= MIN_STILL_CAMERA_FRACTION {
                     "a camera that did not move (walk around the scene with it), "
                 } else {
                     ""
@@ -544,7 +548,7 @@ impl Display for Sentence<'_> {
                 pairs[1],
                 self.list(photos)
             ),
-            Diagnosis::Twice { photos: [a, b] } => write!(
+            Diagnosis::Duplicate { photos: [a, b] } => write!(
                 f,
                 "{} and {} show the same from the same place; delete one",
                 name(a),
@@ -553,16 +557,16 @@ impl Display for Sentence<'_> {
             Diagnosis::Contradiction {
                 pairs,
                 matches,
-                agree,
-                of,
+                agreement,
+                total,
             } => write!(
                 f,
-                "{} of {of} pairs contradict the others, such as {} and {}, where {:.0} % of {matches} matches agree with them: parts \
+                "{} of {total} pairs contradict the others, such as {} and {}, where {:.0} % of {matches} matches agree with them: parts \
                  that look alike may be mistaken for one another, and the model may be folded; include what tells them apart",
                 pairs.len(),
                 name(&pairs[0][0]),
                 name(&pairs[0][1]),
-                100.0 * agree
+                100.0 * agreement
             ),
             Diagnosis::Missing {
                 first: [a, b],

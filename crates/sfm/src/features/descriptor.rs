@@ -13,31 +13,31 @@ const CELLS: usize = 4;
 /// Direction bins of a cell.
 const DIRECTIONS: usize = 8;
 /// Side of a cell, in sigmas of the extremum.
-const CELL: f32 = 3.0;
+const CELL_SIGMAS: f32 = 3.0;
 /// Half the side of the square of pixels that contribute to some cell, in cells.
-const REACH: f32 = 0.5 * (CELLS as f32 + 1.0);
+const RADIUS_CELLS: f32 = 0.5 * (CELLS as f32 + 1.0);
 /// Maximum entry of the normalised histogram, which limits the influence of highlights.
-const CLAMP: f32 = 0.2;
+const MAX_BIN: f32 = 0.2;
 /// Pixels across the square of the largest extremum, plus the length of a vector.
-const ACROSS: usize = 128;
+const MAX_ROW_PIXELS: usize = 128;
 
 /// Cells along a side with a margin of one cell on both sides, so that pixels at the border need no test.
-const MARGINED: usize = CELLS + 2;
+const PADDED_CELLS: usize = CELLS + 2;
 /// Direction bins of a cell with margin: the last bin repeats the first.
-const WRAPPED: usize = DIRECTIONS + 1;
+const WRAPPED_DIRECTIONS: usize = DIRECTIONS + 1;
 
 /// The descriptor at `extremum`, rotated by `angle`, `[row][column][direction]`; `None` where the photograph is flat.
 pub(super) fn describe(level: Level, plane: &Plane, extremum: &Extremum, angle: f32) -> Option<[u8; DESCRIPTOR_BYTES]> {
     let bins = level.run(Histograms { plane, extremum, angle });
     let mut values = [0.0f32; DESCRIPTOR_BYTES];
     for (cell, values) in values.chunks_exact_mut(DIRECTIONS).enumerate() {
-        let at = ((cell / CELLS + 1) * MARGINED + cell % CELLS + 1) * WRAPPED;
+        let at = ((cell / CELLS + 1) * PADDED_CELLS + cell % CELLS + 1) * WRAPPED_DIRECTIONS;
         values.copy_from_slice(&bins[at..at + DIRECTIONS]);
         values[0] += bins[at + DIRECTIONS];
     }
     let norm = values.iter().map(|v| v * v).sum::<f32>().sqrt();
     for value in &mut values {
-        *value = value.min(CLAMP * norm);
+        *value = value.min(MAX_BIN * norm);
     }
     let sum = values.iter().sum::<f32>();
     (sum > 0.0).then(|| values.map(|value| (512.0 * (value / sum).sqrt() + 0.5).min(255.0) as u8))
@@ -50,25 +50,25 @@ struct Histograms<'a> {
 }
 
 impl Kernel for Histograms<'_> {
-    type Output = [f32; MARGINED * MARGINED * WRAPPED];
+    type Output = [f32; PADDED_CELLS * PADDED_CELLS * WRAPPED_DIRECTIONS];
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) -> Self::Output
     where
         S::F: Lanes<Scalar = f32>,
     {
         let Self { plane, extremum, angle } = self;
-        let cell = CELL * extremum.sigma;
-        let reach = REACH * cell;
+        let cell = CELL_SIGMAS * extremum.sigma;
+        let reach = RADIUS_CELLS * cell;
         let (sin, cos) = angle.sin_cos();
         // Half the side of the upright square around the rotated one.
         let half = reach * (sin.abs() + cos.abs());
         let (right, down) = ([cos / cell, sin / cell], [-sin / cell, cos / cell]);
-        let turned = simd.set(angle * (DIRECTIONS as f32 / TAU));
+        let rotation = simd.set(angle * (DIRECTIONS as f32 / TAU));
         let centre = simd.splat(0.5 * CELLS as f64 + 0.5);
-        let inside = simd.set(REACH);
+        let inside = simd.set(RADIUS_CELLS);
         let ramp = simd.lanes(|i| i as f32 + 0.5);
-        let mut bins = [0.0f32; MARGINED * MARGINED * WRAPPED];
-        let mut samples = [[0.0f32; ACROSS]; 5];
+        let mut bins = [0.0f32; PADDED_CELLS * PADDED_CELLS * WRAPPED_DIRECTIONS];
+        let mut samples = [[0.0f32; MAX_ROW_PIXELS]; 5];
         for y in pixels(extremum.y - half, extremum.y + half, plane.height) {
             let rows = rows_around(plane, y);
             let dy = y as f32 + 0.5 - extremum.y;
@@ -90,7 +90,7 @@ impl Kernel for Histograms<'_> {
                 // A Gaussian whose standard deviation is half the grid's side: 2 cells.
                 let weight = magnitude * exp_minus(simd, (u * u + v * v) * simd.splat(1.0 / 8.0));
                 let weight = weight.masked(u.abs().lt(inside)).masked(v.abs().lt(inside));
-                let direction = eighths - turned;
+                let direction = eighths - rotation;
                 let direction = (direction + simd.splat(8.0)).select(direction.lt(simd.splat(0.0)), direction);
                 let direction = (direction - simd.splat(8.0)).select(simd.splat(8.0).le(direction), direction);
                 // Lanes outside the square have no weight; their indices are clamped to the array.
@@ -101,7 +101,8 @@ impl Kernel for Histograms<'_> {
                     bound(v.floor(), CELLS as f64),
                     bound(direction.floor(), DIRECTIONS as f64 - 1.0),
                 );
-                let index = (row * simd.splat(MARGINED as f64) + column) * simd.splat(WRAPPED as f64) + bin;
+                let index =
+                    (row * simd.splat(PADDED_CELLS as f64) + column) * simd.splat(WRAPPED_DIRECTIONS as f64) + bin;
                 let to = i * S::LANES;
                 index.store(&mut samples[0][to..]);
                 weight.store(&mut samples[1][to..]);
@@ -111,12 +112,12 @@ impl Kernel for Histograms<'_> {
             }
             let [index, weight, u, v, t] = &samples;
             for i in 0..columns.len() {
-                const LAST: usize = ((CELLS - 1 + 1) * MARGINED + CELLS) * WRAPPED + DIRECTIONS - 1;
+                const LAST: usize = ((CELLS - 1 + 1) * PADDED_CELLS + CELLS) * WRAPPED_DIRECTIONS + DIRECTIONS - 1;
                 let at = (index[i].to_u32() as usize).min(LAST);
                 let below = weight[i] * v[i];
-                for (row, weight) in [(0, weight[i] - below), (MARGINED * WRAPPED, below)] {
+                for (row, weight) in [(0, weight[i] - below), (PADDED_CELLS * WRAPPED_DIRECTIONS, below)] {
                     let beside = weight * u[i];
-                    for (column, weight) in [(0, weight - beside), (WRAPPED, beside)] {
+                    for (column, weight) in [(0, weight - beside), (WRAPPED_DIRECTIONS, beside)] {
                         let next = weight * t[i];
                         bins[at + row + column] += weight - next;
                         bins[at + row + column + 1] += next;

@@ -7,7 +7,7 @@ use irradia_compute::simd::{Kernel, Lanes, Mask, Simd};
 /// Number of differences in an octave.
 const DIFFERENCES: usize = SCALES + 2;
 /// The fraction of the peak threshold that a sample must reach before its position is refined (VLFeat).
-const COARSE: f32 = 0.8;
+const COARSE_PEAK_FRACTION: f32 = 0.8;
 /// Maximum number of moves by whole pixels during refinement (VLFeat).
 const MAX_MOVES: usize = 5;
 
@@ -31,7 +31,7 @@ pub(super) struct Extremum {
 pub(super) fn find_extrema(sift: &Sift, octave: &Octave, number: usize) -> Vec<Extremum> {
     let mut samples = sift.level.run(Samples {
         octave,
-        threshold: COARSE * sift.peak_threshold,
+        threshold: COARSE_PEAK_FRACTION * sift.peak_threshold,
     });
     samples.sort_unstable_by_key(|[x, y, scale]| [*scale, *y, *x]);
     samples

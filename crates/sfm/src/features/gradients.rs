@@ -13,7 +13,7 @@ where
     let half = simd.splat(0.5);
     let gx = (simd.load(&rows[1][x + 1..]) - simd.load(&rows[1][x - 1..])) * half;
     let gy = (simd.load(&rows[2][x..]) - simd.load(&rows[0][x..])) * half;
-    [(gx * gx + gy * gy).sqrt(), eighths(simd, gy, gx)]
+    [(gx * gx + gy * gy).sqrt(), atan2_eighths(simd, gy, gx)]
 }
 
 /// The rows above, at and below `y`.
@@ -24,7 +24,7 @@ pub(super) fn rows_around(plane: &Plane, y: usize) -> [&[f32]; 3] {
 
 /// `atan2(y, x)` in eighths of a turn, in \[0, 8\], within 1e-5; 0 where both are 0.
 #[inline(always)]
-fn eighths<S: Simd>(simd: S, y: S::F, x: S::F) -> S::F
+fn atan2_eighths<S: Simd>(simd: S, y: S::F, x: S::F) -> S::F
 where
     S::F: Lanes<Scalar = f32>,
 {
@@ -94,7 +94,7 @@ mod tests {
                     .map(|i| {
                         let angle = f64::from(i).to_radians() * 0.1;
                         let (y, x) = (simd.splat(3.0 * angle.sin()), simd.splat(3.0 * angle.cos()));
-                        eighths(simd, y, x).store(&mut out[0]);
+                        atan2_eighths(simd, y, x).store(&mut out[0]);
                         exp_minus(simd, simd.splat(f64::from(i) * 4.6 / 3600.0)).store(&mut out[1]);
                         [out[0][0], out[1][0]]
                     })

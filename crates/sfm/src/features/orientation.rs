@@ -9,18 +9,18 @@ use std::f32::consts::TAU;
 
 const BINS: usize = 36;
 /// Standard deviation of the window, in sigmas of the extremum.
-const WINDOW: f32 = 1.5;
+const WINDOW_SIGMAS: f32 = 1.5;
 /// Number of passes of a box filter over three bins that smooth the histogram.
-const SMOOTHING: usize = 6;
+const SMOOTHING_PASSES: usize = 6;
 /// Further peaks are directions too if they reach this fraction of the highest.
-const PEAK: f32 = 0.8;
+const MIN_PEAK_RATIO: f32 = 0.8;
 /// Pixels across the window of the largest extremum, plus the length of a vector.
-const ACROSS: usize = 64;
+const MAX_ROW_PIXELS: usize = 64;
 
 /// The strongest directions, at most two, in radians from +x towards +y.
 pub(super) fn orientations(level: Level, plane: &Plane, extremum: &Extremum) -> [Option<f32>; 2] {
     let mut histogram = level.run(Histogram { plane, extremum });
-    for _ in 0..SMOOTHING {
+    for _ in 0..SMOOTHING_PASSES {
         let old = histogram;
         for i in 0..BINS {
             histogram[i] = (old[(i + BINS - 1) % BINS] + old[i] + old[(i + 1) % BINS]) / 3.0;
@@ -30,7 +30,7 @@ pub(super) fn orientations(level: Level, plane: &Plane, extremum: &Extremum) -> 
     let mut peaks: Vec<[f32; 2]> = Vec::new();
     for i in 0..BINS {
         let [before, at, after] = [BINS - 1, 0, 1].map(|by| histogram[(i + by) % BINS]);
-        if at > before && at > after && at >= PEAK * highest {
+        if at > before && at > after && at >= MIN_PEAK_RATIO * highest {
             let offset = -0.5 * (after - before) / (after + before - 2.0 * at);
             peaks.push([at, TAU * (i as f32 + 0.5 + offset) / BINS as f32]);
         }
@@ -54,7 +54,7 @@ impl Kernel for Histogram<'_> {
         S::F: Lanes<Scalar = f32>,
     {
         let Self { plane, extremum } = self;
-        let sigma = WINDOW * extremum.sigma;
+        let sigma = WINDOW_SIGMAS * extremum.sigma;
         let radius = (3.0 * sigma).floor().max(1.0);
         // Columns or rows that have neighbours on both sides.
         let span = |centre: f32, side: usize| {
@@ -67,7 +67,11 @@ impl Kernel for Histogram<'_> {
         let scale = simd.set(0.5 / (sigma * sigma));
         let ramp = simd.lanes(|i| i as f32 + 0.5);
         let mut histogram = [0.0f32; BINS + 1];
-        let (mut low, mut fraction, mut weight) = ([0.0f32; ACROSS], [0.0f32; ACROSS], [0.0f32; ACROSS]);
+        let (mut low, mut fraction, mut weight) = (
+            [0.0f32; MAX_ROW_PIXELS],
+            [0.0f32; MAX_ROW_PIXELS],
+            [0.0f32; MAX_ROW_PIXELS],
+        );
         for y in span(extremum.y, plane.height) {
             let rows = rows_around(plane, y);
             let dy = simd.set(y as f32 + 0.5 - extremum.y);

@@ -20,7 +20,7 @@ const CAMERA_SIGMA: f32 = 0.5;
 /// Minimum side of an octave in pixels: a smaller one has no room for a descriptor.
 const MIN_SIDE: usize = 16;
 /// Lanes of the widest vector.
-const WIDEST: usize = 16;
+const MAX_LANES: usize = 16;
 
 /// A plane of floats. Rows are padded so that a vector can be loaded at every pixel and at its neighbours.
 #[derive(Clone, Debug)]
@@ -33,7 +33,7 @@ pub(super) struct Plane {
 
 impl Plane {
     pub(super) fn new(width: usize, height: usize) -> Self {
-        let stride = width.next_multiple_of(WIDEST) + WIDEST;
+        let stride = width.next_multiple_of(MAX_LANES) + MAX_LANES;
         Self {
             width,
             height,

@@ -3,7 +3,7 @@ use super::extrema::{Extremum, find_extrema};
 use super::frontal::frontal_patch;
 use super::orientation::orientations;
 use super::scale_space::{FIRST_SCALE, Octave, Plane};
-use super::spread::spread;
+use super::spread::select_spread;
 use super::{Extractor, GreyPhoto};
 use crate::keypoints::NO_DESCRIPTOR;
 use crate::{DESCRIPTOR_BYTES, Features, Keypoint};
@@ -66,7 +66,7 @@ impl Extractor for Sift {
             width as f32 / reduced.width as f32,
             height as f32 / reduced.height as f32,
         ];
-        self.in_plane(&reduced, |[x, y]| {
+        self.extract_from(&reduced, |[x, y]| {
             let at = |v: f32, enlarge: f32, side: usize| ((v * enlarge) as usize).min(side - 1);
             let pixel = at(y, enlarge[1], height) * width + at(x, enlarge[0], width);
             photo.mask.is_none_or(|mask| mask[pixel] >= MASK_THRESHOLD)
@@ -77,7 +77,7 @@ impl Extractor for Sift {
 
 impl Sift {
     /// The features of `photo` at the positions for which `keep` returns true, in its pixels.
-    fn in_plane(&self, photo: &Plane, keep: impl Fn([f32; 2]) -> bool) -> Features {
+    fn extract_from(&self, photo: &Plane, keep: impl Fn([f32; 2]) -> bool) -> Features {
         let mut octaves: Vec<Vec<Plane>> = Vec::new();
         let mut extrema: Vec<Extremum> = Vec::new();
         // `[x, y, scale]` in the photograph's pixels.
@@ -102,14 +102,14 @@ impl Sift {
             .zip(&extrema)
             .map(|([x, y, scale], extremum)| [*x, *y, scale * extremum.peak])
             .collect();
-        for i in spread(&importance, [photo.width, photo.height], self.max_features) {
+        for i in select_spread(&importance, [photo.width, photo.height], self.max_features) {
             let (extremum, [x, y, scale]) = (&extrema[i], places[i]);
             let plane = &octaves[extremum.octave][extremum.level - FIRST_SCALE];
-            let described = self.described(plane, extremum);
+            let described = self.describe(plane, extremum);
             let frontal = match self.frontal {
                 true => {
                     let (patch, centre) = frontal_patch(&octaves, extremum);
-                    self.described(&patch, &centre)
+                    self.describe(&patch, &centre)
                 }
                 false => [None, None],
             };
@@ -137,7 +137,7 @@ impl Sift {
     }
 
     /// The angles and descriptors at `extremum`, strongest first.
-    fn described(&self, plane: &Plane, extremum: &Extremum) -> [Option<(f32, [u8; DESCRIPTOR_BYTES])>; 2] {
+    fn describe(&self, plane: &Plane, extremum: &Extremum) -> [Option<(f32, [u8; DESCRIPTOR_BYTES])>; 2] {
         orientations(self.level, plane, extremum)
             .map(|angle| angle.and_then(|angle| Some((angle, describe(self.level, plane, extremum, angle)?))))
     }

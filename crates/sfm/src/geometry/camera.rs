@@ -8,7 +8,7 @@ pub const PARAMETERS: usize = 8;
 
 /// Maximum angle from a fisheye's axis that is used, radians: beyond it, points on the plane z = 1, on which poses are estimated, are too
 /// far out.
-const WIDEST: f64 = 1.35;
+const MAX_FISHEYE_ANGLE_RADIANS: f64 = 1.35;
 
 /// Intrinsics of a camera with OpenCV's first four lens coefficients (COLMAP's `OPENCV`), or of a fisheye (`OPENCV_FISHEYE`).
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -29,9 +29,9 @@ pub struct Projection {
     /// Pixels.
     pub at: DVec2,
     /// d at / d (point in camera axes): rows of x and of y.
-    pub by_point: [DVec3; 2],
+    pub point_jacobian: [DVec3; 2],
     /// d at / d parameters: rows of x and of y.
-    pub by_camera: [[f64; PARAMETERS]; 2],
+    pub camera_jacobian: [[f64; PARAMETERS]; 2],
 }
 
 impl DCamera {
@@ -98,7 +98,7 @@ impl DCamera {
     /// Pixels per unit of the plane z = 1 at the point `p` of it, in the radial direction, in which a fisheye has the fewest.
     pub fn focal_at(&self, p: DVec2) -> f64 {
         if self.fisheye {
-            self.focal() * self.angle_slope(p.length().atan()) / (1.0 + p.length_squared())
+            self.focal() * self.fisheye_radius_slope(p.length().atan()) / (1.0 + p.length_squared())
         } else {
             self.focal()
         }
@@ -114,14 +114,14 @@ impl DCamera {
     }
 
     /// The distance from the centre, in focal lengths, at which a fisheye shows the angle `theta` from its axis.
-    fn angle_distance(&self, theta: f64) -> f64 {
+    fn fisheye_radius(&self, theta: f64) -> f64 {
         let [.., k1, k2, k3, k4] = self.parameters;
         let t2 = theta * theta;
         theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
     }
 
-    /// d [`Self::angle_distance`] / d theta.
-    fn angle_slope(&self, theta: f64) -> f64 {
+    /// d [`Self::fisheye_radius`] / d theta.
+    fn fisheye_radius_slope(&self, theta: f64) -> f64 {
         let [.., k1, k2, k3, k4] = self.parameters;
         let t2 = theta * theta;
         1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
@@ -138,8 +138,8 @@ impl DCamera {
         }
         let r = r2.sqrt();
         let theta = r.atan();
-        let scale = self.angle_distance(theta) / r;
-        [scale, (self.angle_slope(theta) / (1.0 + r2) - scale) / r2]
+        let scale = self.fisheye_radius(theta) / r;
+        [scale, (self.fisheye_radius_slope(theta) / (1.0 + r2) - scale) / r2]
     }
 
     #[inline(always)]
@@ -184,12 +184,12 @@ impl DCamera {
         let DVec2 { x: dx, y: dy } = self.distort(x, y);
         let [xx, xy, yy] = self.distort_derivative(x, y);
         let row = |f: f64, a: f64, b: f64| DVec3::new(f * a, f * b, -f * (a * x + b * y)) * inverse;
-        let by_lens = self.by_lens(x, y, r2);
-        let [of_x, of_y] = [0, 1].map(|axis| by_lens.map(|by| [fx, fy][axis] * by[axis]));
+        let lens_jacobian = self.lens_jacobian(x, y, r2);
+        let [of_x, of_y] = [0, 1].map(|axis| lens_jacobian.map(|d| [fx, fy][axis] * d[axis]));
         Projection {
             at: DVec2::new(fx * dx + cx, fy * dy + cy),
-            by_point: [row(fx, xx, xy), row(fy, xy, yy)],
-            by_camera: [
+            point_jacobian: [row(fx, xx, xy), row(fy, xy, yy)],
+            camera_jacobian: [
                 [dx, 0.0, 1.0, 0.0, of_x[0], of_x[1], of_x[2], of_x[3]],
                 [0.0, dy, 0.0, 1.0, of_y[0], of_y[1], of_y[2], of_y[3]],
             ],
@@ -198,7 +198,7 @@ impl DCamera {
 
     /// d distorted / d lens coefficients, of x and of y for each.
     #[inline(always)]
-    fn by_lens(&self, x: f64, y: f64, r2: f64) -> [[f64; 2]; 4] {
+    fn lens_jacobian(&self, x: f64, y: f64, r2: f64) -> [[f64; 2]; 4] {
         if self.fisheye {
             let r = r2.sqrt();
             let theta = r.atan();
@@ -241,17 +241,19 @@ impl DCamera {
     /// Like [`Self::unproject`], for a position in focal lengths from the centre.
     fn unproject_fisheye(&self, target: DVec2) -> Option<DVec2> {
         let distance = target.length();
-        let mut theta = distance.min(WIDEST);
+        let mut theta = distance.min(MAX_FISHEYE_ANGLE_RADIANS);
         for _ in 0..20 {
-            let slope = self.angle_slope(theta);
+            let slope = self.fisheye_radius_slope(theta);
             if slope.is_nan() || slope <= 1e-6 {
                 return None;
             }
-            let step = (self.angle_distance(theta) - distance) / slope;
+            let step = (self.fisheye_radius(theta) - distance) / slope;
             theta -= step;
             if step.abs() < 1e-12 {
                 let scale = if distance > 1e-12 { theta.tan() / distance } else { 1.0 };
-                return (0.0..WIDEST).contains(&theta).then(|| target * scale);
+                return (0.0..MAX_FISHEYE_ANGLE_RADIANS)
+                    .contains(&theta)
+                    .then(|| target * scale);
             }
         }
         None
@@ -297,7 +299,7 @@ mod tests {
             let numeric = (camera.pixel(p + step) - camera.pixel(p - step)) / (2.0 * H);
             for row in 0..2 {
                 assert!(
-                    (projection.by_point[row][axis] - numeric[row]).abs() < 1e-5,
+                    (projection.point_jacobian[row][axis] - numeric[row]).abs() < 1e-5,
                     "{row} {axis}"
                 );
             }
@@ -311,7 +313,7 @@ mod tests {
             let numeric = (moved(H) - moved(-H)) / (2.0 * H);
             for row in 0..2 {
                 assert!(
-                    (projection.by_camera[row][parameter] - numeric[row]).abs() < 1e-5,
+                    (projection.camera_jacobian[row][parameter] - numeric[row]).abs() < 1e-5,
                     "{row} {parameter}"
                 );
             }

@@ -6,7 +6,7 @@ use irradia_compute::unroll;
 use std::marker::PhantomData;
 
 /// Padding of the planes: a multiple of every vector's length.
-const PAD: usize = 16;
+const LANE_MULTIPLE: usize = 16;
 
 /// Corresponding points of two photographs.
 #[derive(Clone, Debug, Default)]
@@ -20,7 +20,7 @@ pub struct Correspondences {
 impl Correspondences {
     /// From pairs of points.
     pub fn new(points: Vec<[DVec2; 2]>) -> Self {
-        let padded = points.len().next_multiple_of(PAD);
+        let padded = points.len().next_multiple_of(LANE_MULTIPLE);
         let plane = |value: fn(&[DVec2; 2]) -> f64| {
             let mut plane: Vec<f32> = points.iter().map(|p| value(p) as f32).collect();
             plane.resize(padded, f32::NAN);

@@ -54,17 +54,17 @@ pub fn rotation_between(points: impl Iterator<Item = [DVec2; 2]>) -> DMat3 {
 }
 
 /// How many of `points` a rotation explains with errors below `threshold` in the second photograph. The rotation is fitted to all points,
-/// then again to those within each of the distances `coarser`.
-pub fn turned(points: &[[DVec2; 2]], coarser: &[f64], threshold: f64) -> usize {
-    let close = |rotation: &DMat3, [a, b]: &[DVec2; 2], within: f64| {
-        let turned = *rotation * a.extend(1.0);
-        turned.z > 0.0 && (turned.truncate() / turned.z - *b).length() < within
+/// then again to those within each of the distances `coarse_thresholds`.
+pub fn count_rotation_inliers(points: &[[DVec2; 2]], coarse_thresholds: &[f64], threshold: f64) -> usize {
+    let is_inlier = |rotation: &DMat3, [a, b]: &[DVec2; 2], within: f64| {
+        let rotated = *rotation * a.extend(1.0);
+        rotated.z > 0.0 && (rotated.truncate() / rotated.z - *b).length() < within
     };
     let mut rotation = rotation_between(points.iter().copied());
-    for within in coarser {
-        rotation = rotation_between(points.iter().copied().filter(|p| close(&rotation, p, *within)));
+    for within in coarse_thresholds {
+        rotation = rotation_between(points.iter().copied().filter(|p| is_inlier(&rotation, p, *within)));
     }
-    points.iter().filter(|p| close(&rotation, p, threshold)).count()
+    points.iter().filter(|p| is_inlier(&rotation, p, threshold)).count()
 }
 
 /// Estimation of the homography from correspondences.

@@ -54,7 +54,7 @@ pub fn estimate<E: Estimator>(problem: &E, first: Vec<E::Model>, limits: Limits)
     let mut models = Vec::new();
     let mut sample = vec![0; E::SAMPLE];
     let mut drawn = 0;
-    while drawn < needed(&best, n, E::SAMPLE, limits) {
+    while drawn < needed_samples(&best, n, E::SAMPLE, limits) {
         drawn += 1;
         for i in 0..E::SAMPLE {
             sample[i] = loop {
@@ -74,13 +74,13 @@ pub fn estimate<E: Estimator>(problem: &E, first: Vec<E::Model>, limits: Limits)
 }
 
 /// Number of samples needed for the confidence, given the inliers of the best model so far.
-fn needed<M>(best: &Option<Estimate<M>>, n: usize, sample: usize, limits: Limits) -> usize {
+fn needed_samples<M>(best: &Option<Estimate<M>>, n: usize, sample: usize, limits: Limits) -> usize {
     let Some(best) = best else { return limits.samples };
-    let good = (best.inliers as f64 / n as f64).powi(sample as i32);
-    if good >= 1.0 {
+    let clean_fraction = (best.inliers as f64 / n as f64).powi(sample as i32);
+    if clean_fraction >= 1.0 {
         return limits.samples.min(1);
     }
-    let samples = (1.0 - limits.confidence).ln() / (1.0 - good).ln();
+    let samples = (1.0 - limits.confidence).ln() / (1.0 - clean_fraction).ln();
     limits.samples.min(if samples.is_finite() {
         samples.ceil() as usize
     } else {

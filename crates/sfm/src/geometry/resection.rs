@@ -146,11 +146,11 @@ impl Resection {
     pub fn inliers(&self, pose: &DPose) -> Vec<bool> {
         self.points
             .iter()
-            .map(|(at, point)| self.squared(pose, *at, *point) < self.threshold.powi(2))
+            .map(|(at, point)| self.squared_error(pose, *at, *point) < self.threshold.powi(2))
             .collect()
     }
 
-    fn squared(&self, pose: &DPose, at: DVec2, point: DVec3) -> f64 {
+    fn squared_error(&self, pose: &DPose, at: DVec2, point: DVec3) -> f64 {
         let p = pose.camera_from_world(point);
         if p.z > 0.0 {
             (p.truncate() / p.z - at).length_squared()

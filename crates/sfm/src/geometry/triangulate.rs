@@ -6,7 +6,7 @@ use glam::{DMat3, DVec2, DVec3};
 
 /// One camera's view of a point.
 #[derive(Clone, Copy, Debug)]
-pub struct Sight {
+pub struct ViewRay {
     /// From world to camera axes.
     pub rotation: DMat3,
     /// Camera centre, world.
@@ -17,8 +17,8 @@ pub struct Sight {
     pub focal: f64,
 }
 
-impl Sight {
-    /// The sight of a camera at `pose`.
+impl ViewRay {
+    /// The ray of a camera at `pose`.
     pub fn new(pose: &DPose, at: DVec2, focal: f64) -> Self {
         Self {
             rotation: pose.camera_rotation(),
@@ -44,38 +44,38 @@ impl Sight {
 }
 
 /// The point with the smallest sum of squared distances to all rays; `None` if they are parallel.
-pub fn midpoint(sights: impl Iterator<Item = Sight>) -> Option<DVec3> {
+pub fn midpoint(rays: impl Iterator<Item = ViewRay>) -> Option<DVec3> {
     let mut normal = DMat3::ZERO;
     let mut right = DVec3::ZERO;
-    for sight in sights {
-        let d = sight.direction();
+    for ray in rays {
+        let d = ray.direction();
         let across = DMat3::IDENTITY - DMat3::from_cols(d * d.x, d * d.y, d * d.z);
         normal += across;
-        right += across * sight.position;
+        right += across * ray.position;
     }
     let point = solve_spd(normal.transpose().to_cols_array_2d(), right.to_array()).map(DVec3::from_array)?;
     point.is_finite().then_some(point)
 }
 
 /// Refines `start` by Gauss-Newton steps on the reprojection error in pixels.
-pub fn refine_point(start: DVec3, sights: impl Iterator<Item = Sight> + Clone, steps: usize) -> Option<DVec3> {
+pub fn refine_point(start: DVec3, rays: impl Iterator<Item = ViewRay> + Clone, steps: usize) -> Option<DVec3> {
     let mut point = start;
     for _ in 0..steps {
         let mut normal = [[0.0; 3]; 3];
         let mut gradient = [0.0; 3];
-        for sight in sights.clone() {
-            let p = sight.rotation * (point - sight.position);
+        for ray in rays.clone() {
+            let p = ray.rotation * (point - ray.position);
             if p.z <= 0.0 {
                 return None;
             }
-            let inverse = sight.focal / p.z;
+            let inverse = ray.focal / p.z;
             let (x, y) = (p.x / p.z, p.y / p.z);
-            let rows = sight.rotation.transpose();
+            let rows = ray.rotation.transpose();
             let (jx, jy) = (
                 (rows.x_axis - rows.z_axis * x) * inverse,
                 (rows.y_axis - rows.z_axis * y) * inverse,
             );
-            let (rx, ry) = ((x - sight.at.x) * sight.focal, (y - sight.at.y) * sight.focal);
+            let (rx, ry) = ((x - ray.at.x) * ray.focal, (y - ray.at.y) * ray.focal);
             for i in 0..3 {
                 gradient[i] -= jx[i] * rx + jy[i] * ry;
                 for j in 0..3 {
@@ -112,17 +112,17 @@ mod tests {
         for (views, tolerance) in [(&exact, 1e-9), (&noisy, 0.3)] {
             let second = DPose::from_camera_from_world(views.motion.rotation, views.motion.translation);
             for (p, world) in views.points.iter().zip(&views.world) {
-                let sights = [
-                    Sight::new(&DPose::IDENTITY, p[0], 500.0),
-                    Sight::new(&second, p[1], 500.0),
+                let rays = [
+                    ViewRay::new(&DPose::IDENTITY, p[0], 500.0),
+                    ViewRay::new(&second, p[1], 500.0),
                 ];
-                let start = midpoint(sights.into_iter()).expect("rays meet");
-                let point = refine_point(start, sights.into_iter(), 5).expect("in front");
+                let start = midpoint(rays.into_iter()).expect("rays meet");
+                let point = refine_point(start, rays.into_iter(), 5).expect("in front");
                 assert!(
                     (point - *world).length() < tolerance * world.length(),
                     "{point} {world}"
                 );
-                let error = |x| sights.iter().map(|s| s.error_squared(x)).sum::<f64>();
+                let error = |x| rays.iter().map(|s| s.error_squared(x)).sum::<f64>();
                 assert!(error(point) <= error(start) + 1e-12);
             }
         }
@@ -134,9 +134,9 @@ mod tests {
             position: DVec3::X,
             ..DPose::IDENTITY
         };
-        let sights = [DPose::IDENTITY, beside].map(|pose| Sight::new(&pose, DVec2::ZERO, 1.0));
-        assert!(midpoint(sights.into_iter()).is_none_or(|p| p.length() > 1e6));
+        let rays = [DPose::IDENTITY, beside].map(|pose| ViewRay::new(&pose, DVec2::ZERO, 1.0));
+        assert!(midpoint(rays.into_iter()).is_none_or(|p| p.length() > 1e6));
         let behind = DVec3::new(0.0, 0.0, -1.0);
-        assert_eq!(sights[0].error_squared(behind), f64::INFINITY);
+        assert_eq!(rays[0].error_squared(behind), f64::INFINITY);
     }
 }

@@ -6,7 +6,7 @@ use crate::geometry::linear::solve_spd;
 use glam::{DQuat, DVec3};
 
 /// Mean length of a two-dimensional error relative to the standard deviation of each coordinate: the square root of pi / 2.
-const MEAN_LENGTH: f64 = 1.253_314_137_315_5;
+const RAYLEIGH_MEAN: f64 = 1.253_314_137_315_5;
 
 /// A known distance between two cameras.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -29,7 +29,7 @@ pub struct DistanceFit {
 /// Scales `model` to metres about its origin: the sum of its distances becomes that of the known ones, so long distances count more.
 ///
 /// `None`, and nothing changes, if a photograph has no pose or the cameras cannot be told to be at different places.
-pub fn to_distances(model: &mut Model, photos: &[PhotoInfo], distances: &[Distance]) -> Option<DistanceFit> {
+pub fn scale_to_distances(model: &mut Model, photos: &[PhotoInfo], distances: &[Distance]) -> Option<DistanceFit> {
     let (mut metres, mut units, mut variance) = (0.0, 0.0, 0.0);
     let mut lengths = Vec::new();
     for distance in distances {
@@ -92,7 +92,7 @@ fn position_variance(model: &Model, photos: &[PhotoInfo], photo: usize, along: D
         if !seen || p.z <= 0.0 {
             continue;
         }
-        for row in camera.project(p).by_point {
+        for row in camera.project(p).point_jacobian {
             // A shift of the camera moves the point in the opposite direction, a turn rotates it about the camera.
             let [shift, turn] = [-(from_world.transpose() * row), p.cross(row)];
             let row = [shift.x, shift.y, shift.z, turn.x, turn.y, turn.z];
@@ -105,7 +105,7 @@ fn position_variance(model: &Model, photos: &[PhotoInfo], photo: usize, along: D
     }
     let direction = [along.x, along.y, along.z, 0.0, 0.0, 0.0];
     let solved = solve_spd(information, direction)?;
-    let deviation = model.mean_error() / MEAN_LENGTH;
+    let deviation = model.mean_error() / RAYLEIGH_MEAN;
     let variance: f64 = direction.iter().zip(&solved).map(|(a, b)| a * b).sum();
     Some(deviation * deviation * variance)
 }

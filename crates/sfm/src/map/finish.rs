@@ -1,6 +1,6 @@
 //! The final result: an upright, centred model, and a reason for each photograph that is in no model.
 
-use super::model::Working;
+use super::model::GrowingModel;
 use super::types::{LeftOut, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, Reason, VerifiedPair};
 use crate::geometry::align::Alignment;
 use crate::geometry::pose::DPose;
@@ -9,8 +9,8 @@ use crate::{Features, PairMatches, median};
 use glam::{DQuat, DVec3};
 
 /// The model in its final, upright world.
-pub(super) fn finish(working: &Working, photos: &[PhotoInfo]) -> Model {
-    let mut model = collected(working, photos);
+pub(super) fn finish(working: &GrowingModel, photos: &[PhotoInfo]) -> Model {
+    let mut model = extract_model(working, photos);
     let alignment = upright(&model, photos);
     for pose in model.poses.iter_mut().flatten() {
         *pose = alignment.pose(pose);
@@ -22,7 +22,7 @@ pub(super) fn finish(working: &Working, photos: &[PhotoInfo]) -> Model {
 }
 
 /// The model in the world in which it grew.
-pub(super) fn collected(working: &Working, photos: &[PhotoInfo]) -> Model {
+pub(super) fn extract_model(working: &GrowingModel, photos: &[PhotoInfo]) -> Model {
     let mut model = Model {
         cameras: Vec::new(),
         poses: working.poses.clone(),
@@ -36,12 +36,12 @@ pub(super) fn collected(working: &Working, photos: &[PhotoInfo]) -> Model {
             .any(|(photo, pose)| photo.group == group && pose.is_some());
         model.cameras.push(present.then_some(*camera));
     }
-    for track in working.with_points() {
+    for track in working.triangulated_tracks() {
         let position = working.points[track].expect("listed");
         let used: Vec<usize> = working.tracks.range(track).filter(|o| working.used[*o]).collect();
         let errors = used
             .iter()
-            .filter_map(|o| Some(working.sight(*o)?.error_squared(position).sqrt()));
+            .filter_map(|o| Some(working.view_ray(*o)?.error_squared(position).sqrt()));
         model.points.push(ModelPoint {
             position,
             error: errors.sum::<f64>() / used.len() as f64,
@@ -60,17 +60,18 @@ pub(super) fn collected(working: &Working, photos: &[PhotoInfo]) -> Model {
 /// The alignment to a world in which +Z is up, the points' median is the origin and the cameras' median distance from it is 1.
 fn upright(model: &Model, photos: &[PhotoInfo]) -> Alignment {
     let cameras = photos.iter().zip(&model.poses);
-    let held = || up(cameras.filter_map(|(photo, pose)| Some((pose.as_ref()?.rotation, photo.up))));
+    let mean_up = || up(cameras.filter_map(|(photo, pose)| Some((pose.as_ref()?.rotation, photo.up))));
     let poses: Vec<DPose> = model.poses.iter().flatten().copied().collect();
     let points = model.points.iter().map(|point| point.position);
-    let is_open = photos.iter().all(|photo| photo.up.is_none());
-    let survey = survey(&poses, points).filter(|_| is_open);
-    let up = survey.map_or_else(held, |survey| survey.up);
+    let is_up_unknown = photos.iter().all(|photo| photo.up.is_none());
+    let survey = survey(&poses, points).filter(|_| is_up_unknown);
+    let up = survey.map_or_else(mean_up, |survey| survey.up);
     let rotation = DQuat::from_rotation_arc(up, DVec3::Z);
-    let middle = |values| median(values).unwrap_or(0.0);
-    let center =
-        DVec3::from_array([0, 1, 2].map(|axis| middle(model.points.iter().map(|p| p.position[axis]).collect())));
-    let distance = middle(
+    let median_or_zero = |values| median(values).unwrap_or(0.0);
+    let center = DVec3::from_array(
+        [0, 1, 2].map(|axis| median_or_zero(model.points.iter().map(|p| p.position[axis]).collect())),
+    );
+    let distance = median_or_zero(
         model
             .poses
             .iter()
@@ -92,8 +93,8 @@ pub(super) fn left_out(
     features: &[Features],
     pairs: &[PairMatches],
     verified: &[VerifiedPair],
-    taken: &[bool],
-    tried: &[usize],
+    assigned: &[bool],
+    failed_registrations: &[usize],
     options: &MapOptions,
 ) -> Vec<LeftOut> {
     let reason = |photo: usize| {
@@ -115,13 +116,13 @@ pub(super) fn left_out(
         if partners.is_empty() {
             return Reason::NoGeometry { best };
         }
-        let in_model = partners.iter().any(|p| p.photos.iter().any(|p| taken[*p as usize]));
+        let in_model = partners.iter().any(|p| p.photos.iter().any(|p| assigned[*p as usize]));
         if partners.iter().all(|p| p.kind == PairKind::Rotation) {
             return Reason::RotationOnly {
                 partners: partners.len(),
             };
         }
-        if in_model || tried[photo] > 0 {
+        if in_model || failed_registrations[photo] > 0 {
             return Reason::NotRegistered {
                 partners: partners.len(),
             };
@@ -131,7 +132,7 @@ pub(super) fn left_out(
         }
     };
     (0..photos.len())
-        .filter(|p| !taken[*p])
+        .filter(|p| !assigned[*p])
         .map(|photo| LeftOut {
             photo,
             reason: reason(photo),

@@ -11,15 +11,15 @@ use crate::adjust::{AdjustedCamera, Focal, Freedom};
 use crate::geometry::camera::DCamera;
 
 /// Focal length, relative to the long side, above which no fisheye is tried: it is that of a 71 degree field of view along the long side.
-const WIDE: f64 = 0.7;
+const MAX_FOCAL: f64 = 0.7;
 /// Maximum cost with a fisheye relative to that with a perspective lens: 0.52 and 0.81 for fisheye lenses, 1.85 for another lens.
-const BETTER: f64 = 0.9;
+const MAX_COST_RATIO: f64 = 0.9;
 /// Minimum number of photographs to determine a lens.
-const LEAST: usize = 5;
+const MIN_PHOTOS: usize = 5;
 
 /// The groups of a model whose lens is rather a fisheye, each with the camera that fits.
 pub(super) fn find(photos: &[PhotoInfo], features: &[Features], model: &Model) -> Vec<(usize, DCamera)> {
-    let is_wide = |camera: &DCamera| camera.focal() < WIDE * camera.long_side();
+    let is_wide = |camera: &DCamera| camera.focal() < MAX_FOCAL * camera.long_side();
     let count = |group: usize| {
         (0..photos.len())
             .filter(|p| photos[*p].group == group && model.poses[*p].is_some())
@@ -32,7 +32,7 @@ pub(super) fn find(photos: &[PhotoInfo], features: &[Features], model: &Model) -
     };
     let groups = (0..model.cameras.len()).filter(|group| {
         let wide = model.cameras[*group].as_ref().is_some_and(is_wide);
-        wide && count(*group) >= LEAST && !is_known(*group)
+        wide && count(*group) >= MIN_PHOTOS && !is_known(*group)
     });
     let groups: Vec<usize> = groups.collect();
     if groups.is_empty() {
@@ -44,7 +44,7 @@ pub(super) fn find(photos: &[PhotoInfo], features: &[Features], model: &Model) -
         (problem.solve(&readjust::OPTIONS).final_cost, problem)
     };
     let ((perspective, _), (fisheye, found)) = (adjusted(false), adjusted(true));
-    if fisheye.is_nan() || fisheye > BETTER * perspective {
+    if fisheye.is_nan() || fisheye > MAX_COST_RATIO * perspective {
         return Vec::new();
     }
     groups

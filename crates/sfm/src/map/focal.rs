@@ -1,7 +1,7 @@
 //! Focal lengths before any adjustment: from metadata, from pairs, or a common value.
 
 use super::types::{MapOptions, PhotoInfo};
-use super::verify::{Cameras, Uncalibrated, centered_points, essential_from, select};
+use super::verify::{Cameras, UncalibratedPair, centered_points, essential_from, select};
 use crate::geometry::camera::DCamera;
 use crate::geometry::correspondences::Correspondences;
 use crate::geometry::essential::{motions, refine_motion};
@@ -11,7 +11,7 @@ use rayon::prelude::*;
 
 /// Where a focal length comes from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Source {
+pub enum FocalSource {
     /// The photographs' metadata.
     Prior,
     /// The pairs: the focal length that fits their matches best.
@@ -21,42 +21,42 @@ pub enum Source {
 }
 
 /// The guess, relative to the long side (COLMAP's default).
-pub(super) const GUESS: f64 = 1.2;
+pub(super) const DEFAULT_FOCAL: f64 = 1.2;
 /// Candidates, relative to the long side: fields of view from 90 down to 8 degrees, in steps of 7 %.
-const FIRST: f64 = 0.5;
-const STEP: f64 = 1.07;
-const CANDIDATES: i32 = 40;
+const MIN_CANDIDATE: f64 = 0.5;
+const CANDIDATE_STEP: f64 = 1.07;
+const CANDIDATE_COUNT: i32 = 40;
 /// Number of further candidates, up to a field of view of 126 degrees, that are tried if the first of those above is the best: 30
 /// photographs of a white tree on a table by a webcam with a field of view of 116 degrees led to an entirely wrong model at 1.1 long
 /// sides instead of 0.31. They are not tried otherwise, since wrong matches fit them as well: in a second attempt, those of a box fit
 /// 0.4 % better at 0.29 than at the correct 0.8.
-const WIDER: i32 = 10;
+const WIDE_CANDIDATE_COUNT: i32 = 10;
 /// Minimum ratio of the cost at the shortest candidate to the lowest cost for the further candidates to count: 1.09 to 2.2 where they are
 /// right, 1.01 to 1.07 for turntables and few photographs, which any short focal length fits.
-const RISES: f64 = 1.1;
+const MIN_WIDE_COST_RATIO: f64 = 1.1;
 /// Maximum ratio of the cost at the metadata's focal length to the lowest cost for the metadata to be trusted.
-const PRIOR: f64 = 1.25;
+const MAX_PRIOR_COST_RATIO: f64 = 1.25;
 /// Ratio up to which the focal lengths of one camera in two models are the same. Two films of a brick car, with models of 507 and 218
 /// frames: 1.0001 and 1.009.
-const ALIKE: f64 = 1.02;
+const MAX_SIMILAR_RATIO: f64 = 1.02;
 /// Ratio between a focal length and its initial value above which they are far apart. For frames of a brick car, the pairs say 0.6 long
 /// sides; correct models end at 1.0, wrong ones, flat and far away, at 3 to 8.
-const FAR: f64 = 3.0;
+const MAX_ADJUSTMENT_RATIO: f64 = 3.0;
 /// Maximum number of pairs that vote, those with most inliers.
-const VOTERS: usize = 40;
-/// Number of pairs from which voters are selected when all photographs have metadata.
-pub(super) const ENOUGH: usize = 120;
+const MAX_VOTING_PAIRS: usize = 40;
+/// Number of pairs from which the voting ones are selected when all photographs have metadata.
+pub(super) const MAX_CHECKED_PAIRS: usize = 120;
 /// Maximum number of points of each pair that votes.
-const POINTS: usize = 300;
+const MAX_VOTING_POINTS: usize = 300;
 
 /// Whether two models found the same focal length for a camera, px.
-pub(super) fn are_alike(a: f64, b: f64) -> bool {
-    a.max(b) < ALIKE * a.min(b)
+pub(super) fn are_similar(a: f64, b: f64) -> bool {
+    a.max(b) < MAX_SIMILAR_RATIO * a.min(b)
 }
 
 /// Whether a focal length ended far from where it began, px.
-pub(super) fn are_far(a: f64, b: f64) -> bool {
-    a.max(b) > FAR * a.min(b)
+pub(super) fn are_far_apart(a: f64, b: f64) -> bool {
+    a.max(b) > MAX_ADJUSTMENT_RATIO * a.min(b)
 }
 
 /// The camera of each group.
@@ -64,7 +64,7 @@ pub(super) fn cameras(
     photos: &[PhotoInfo],
     features: &[Features],
     pairs: &[PairMatches],
-    uncalibrated: &[&Uncalibrated],
+    uncalibrated: &[&UncalibratedPair],
     options: &MapOptions,
 ) -> Cameras {
     let groups = photos.iter().map(|p| p.group + 1).max().unwrap_or(0);
@@ -72,7 +72,7 @@ pub(super) fn cameras(
         .map(|group| {
             let members: Vec<&PhotoInfo> = photos.iter().filter(|p| p.group == group).collect();
             let Some(first) = members.first() else {
-                return (DCamera::centered(1, 1, 1.0), Source::Guess);
+                return (DCamera::centered(1, 1, 1.0), FocalSource::Guess);
             };
             let long_side = f64::from(first.width.max(first.height));
             let mut priors: Vec<f64> = members.iter().filter_map(|p| p.focal_prior_px).collect();
@@ -80,12 +80,12 @@ pub(super) fn cameras(
             let prior = priors.get(priors.len() / 2).map(|prior| prior / long_side);
             let (focal, source) = match (
                 prior,
-                vote(group, photos, features, pairs, uncalibrated, prior, options),
+                estimate_focal(group, photos, features, pairs, uncalibrated, prior, options),
             ) {
-                (Some(prior), None) => (prior, Source::Prior),
+                (Some(prior), None) => (prior, FocalSource::Prior),
                 // The metadata of a photograph that was cropped or scaled later are wrong.
-                (_, Some(focal)) => (focal, Source::Pairs),
-                (None, None) => (GUESS, Source::Guess),
+                (_, Some(focal)) => (focal, FocalSource::Pairs),
+                (None, None) => (DEFAULT_FOCAL, FocalSource::Guess),
             };
             let focal = focal * long_side;
             (DCamera::centered(first.width, first.height, focal), source)
@@ -98,50 +98,55 @@ pub(super) fn cameras(
 ///
 /// Each pair's fundamental matrix gives an essential matrix for each candidate, which is refined on the pair's inliers; the
 /// candidate with the lowest sum of MSAC costs wins. Pairs that any focal length fits (planes, turns) add the same cost to all.
-fn vote(
+fn estimate_focal(
     group: usize,
     photos: &[PhotoInfo],
     features: &[Features],
     pairs: &[PairMatches],
-    uncalibrated: &[&Uncalibrated],
+    uncalibrated: &[&UncalibratedPair],
     prior: Option<f64>,
     options: &MapOptions,
 ) -> Option<f64> {
-    let mut voters: Vec<&Uncalibrated> = uncalibrated
+    let mut voting_pairs: Vec<&UncalibratedPair> = uncalibrated
         .iter()
         .copied()
         .filter(|u| u.count >= 30 && pairs[u.pair].photos.iter().all(|p| photos[*p as usize].group == group))
         .collect();
-    voters.sort_by_key(|u| (std::cmp::Reverse(u.count), u.pair));
-    // Neighbours have the most inliers but the least parallax, so the voters are spread evenly over the better half.
-    let step = (voters.len() / 2 / VOTERS).max(1);
-    let voters: Vec<Voter> = voters
+    voting_pairs.sort_by_key(|u| (std::cmp::Reverse(u.count), u.pair));
+    // Neighbours have the most inliers but the least parallax, so the voting pairs are spread evenly over the better half.
+    let step = (voting_pairs.len() / 2 / MAX_VOTING_PAIRS).max(1);
+    let voting_pairs: Vec<VotingPair> = voting_pairs
         .into_iter()
         .step_by(step)
-        .take(VOTERS)
-        .map(|voter| Voter::new(voter, photos, features, pairs, options))
+        .take(MAX_VOTING_PAIRS)
+        .map(|pair| VotingPair::new(pair, photos, features, pairs, options))
         .collect();
-    if voters.is_empty() {
+    if voting_pairs.is_empty() {
         return None;
     }
     let totals = |focals: &[f64]| -> Vec<f64> {
-        let of_voter = |voter: &Voter| focals.iter().map(|focal| voter.cost(*focal)).collect();
-        let costs: Vec<Vec<f64>> = voters.par_iter().map(of_voter).collect();
+        let of_pair = |pair: &VotingPair| focals.iter().map(|focal| pair.cost(*focal)).collect();
+        let costs: Vec<Vec<f64>> = voting_pairs.par_iter().map(of_pair).collect();
         (0..focals.len()).map(|i| costs.iter().map(|c| c[i]).sum()).collect()
     };
     let lowest = |total: &[f64]| (0..total.len()).min_by(|a, b| total[*a].total_cmp(&total[*b]));
-    let mut focals: Vec<f64> = (0..CANDIDATES).map(|i| FIRST * STEP.powi(i)).collect();
+    let mut focals: Vec<f64> = (0..CANDIDATE_COUNT)
+        .map(|i| MIN_CANDIDATE * CANDIDATE_STEP.powi(i))
+        .collect();
     let mut total = totals(&focals);
     if lowest(&total) == Some(0) {
-        let wider: Vec<f64> = (1..=WIDER).rev().map(|i| FIRST * STEP.powi(-i)).collect();
+        let wider: Vec<f64> = (1..=WIDE_CANDIDATE_COUNT)
+            .rev()
+            .map(|i| MIN_CANDIDATE * CANDIDATE_STEP.powi(-i))
+            .collect();
         total.splice(0..0, totals(&wider));
         focals.splice(0..0, wider);
-        if total[0] < RISES * total[lowest(&total)?] {
+        if total[0] < MIN_WIDE_COST_RATIO * total[lowest(&total)?] {
             return None;
         }
     }
     let best = lowest(&total)?;
-    if prior.is_some_and(|prior| totals(&[prior])[0] < PRIOR * total[best]) {
+    if prior.is_some_and(|prior| totals(&[prior])[0] < MAX_PRIOR_COST_RATIO * total[best]) {
         return None;
     }
     let worst = total.iter().fold(0.0f64, |m, x| m.max(*x));
@@ -151,11 +156,11 @@ fn vote(
     // The vertex of the parabola through the best candidate and its neighbours.
     let (before, at, after) = (total[best - 1], total[best], total[best + 1]);
     let offset = 0.5 * (before - after) / (before - 2.0 * at + after);
-    Some(focals[best] * STEP.powf(if offset.is_finite() { offset } else { 0.0 }))
+    Some(focals[best] * CANDIDATE_STEP.powf(if offset.is_finite() { offset } else { 0.0 }))
 }
 
 /// A pair that votes.
-struct Voter {
+struct VotingPair {
     /// Its fundamental matrix.
     matrix: DMat3,
     /// Some of its inliers, centred and divided by the long side.
@@ -164,21 +169,21 @@ struct Voter {
     threshold: f64,
 }
 
-impl Voter {
+impl VotingPair {
     fn new(
-        of: &Uncalibrated,
+        uncalibrated: &UncalibratedPair,
         photos: &[PhotoInfo],
         features: &[Features],
         pairs: &[PairMatches],
         options: &MapOptions,
     ) -> Self {
-        let pair = &pairs[of.pair];
-        let points = select(&centered_points(photos, features, pair), &of.inliers);
-        let thin = points.len().div_ceil(POINTS).max(1);
+        let pair = &pairs[uncalibrated.pair];
+        let points = select(&centered_points(photos, features, pair), &uncalibrated.inliers);
+        let step = points.len().div_ceil(MAX_VOTING_POINTS).max(1);
         let first = &photos[pair.photos[0] as usize];
         Self {
-            matrix: of.matrix,
-            points: points.into_iter().step_by(thin).collect(),
+            matrix: uncalibrated.matrix,
+            points: points.into_iter().step_by(step).collect(),
             // A quarter of the threshold: the remaining errors are those of the model, not wrong matches.
             threshold: 0.25 * options.max_epipolar_error / f64::from(first.width.max(first.height)),
         }

@@ -1,7 +1,7 @@
 //! Growing a model from a seed, photograph by photograph.
 
-use super::focal::{Source, are_alike};
-use super::model::Working;
+use super::focal::{FocalSource, are_similar};
+use super::model::GrowingModel;
 use super::refine::Extent;
 use super::seed::seeds;
 use super::tracks::Tracks;
@@ -13,67 +13,67 @@ use crate::geometry::resection::Resection;
 use glam::{DVec2, DVec3};
 
 /// Maximum number of seeds tried for one model, and of candidates from which they are selected.
-const SEEDS: usize = 12;
-const CANDIDATES: usize = 20 * SEEDS;
+const MAX_SEEDS: usize = 12;
+const MAX_SEED_CANDIDATES: usize = 20 * MAX_SEEDS;
 /// Minimum fraction of its photographs' observations that a doubtful model must explain, such as one whose focal lengths are open.
 /// Correct models of six captures, each cropped in ten ways, explain 0.88 to 1.00, and of a clock with three models 0.74; wrong ones
 /// 0.06 to 0.67.
-const EXPLAINED: f64 = 0.8;
+const MIN_EXPLAINED_FRACTION: f64 = 0.8;
 /// Number of times a photograph is tried before it is given up.
-const TRIES: usize = 3;
+const MAX_REGISTRATION_ATTEMPTS: usize = 3;
 /// Minimum number of points of a pair of photographs for a seed.
-const SEED_POINTS: usize = 12;
+const MIN_SEED_POINTS: usize = 12;
 /// Minimum fraction of inliers among the points that a photograph shows. Photographs with less than the first wait until the others are
 /// registered and everything is adjusted; then the second applies.
-const STRICT: f64 = 0.5;
-const LENIENT: f64 = 0.25;
+const STRICT_INLIER_RATIO: f64 = 0.5;
+const LENIENT_INLIER_RATIO: f64 = 0.25;
 /// Focal lengths tried for the first photograph of a camera, relative to the current one: steps of 15 %, from 0.5 to 4.8 long sides where
 /// that is a guess. The best must be between the ends: for a wrong pose far away, with a long focal length, there is no minimum.
-const FOCALS: [f64; 17] = [
+const FOCAL_FACTORS: [f64; 17] = [
     0.43, 0.5, 0.57, 0.66, 0.76, 0.87, 1.0, 1.15, 1.32, 1.52, 1.75, 2.0, 2.3, 2.65, 3.05, 3.5, 4.0,
 ];
 /// Maximum number of rounds of adjustment, filtering and triangulation at the end.
-const LAST_ROUNDS: usize = 3;
+const MAX_FINAL_ROUNDS: usize = 3;
 
 /// The largest model over several seeds among photographs not yet taken; `None` if there is none.
 ///
 /// The search ends with a seed whose model has more than half of the photographs it could reach. Two photographs with wrong focal lengths
 /// may lead to a wrong model of all photographs, which explains a third of their observations instead of nine tenths: where focal lengths
 /// are open, or end far from where they began, the model must explain most observations as well. So must a model of few photographs: a
-/// seed with wrong poses hardly finds others that disagree. `tried` counts failed registrations.
-pub(super) fn model<'a>(
+/// seed with wrong poses hardly finds others that disagree. The failures of the best seed are added to `failed_registrations`.
+pub(super) fn grow_model<'a>(
     photos: &'a [PhotoInfo],
     cameras: &Cameras,
     pairs: &[VerifiedPair],
     tracks: &'a Tracks,
-    taken: &[bool],
-    tried: &mut [usize],
+    assigned: &[bool],
+    failed_registrations: &mut [usize],
     options: &'a MapOptions,
     progress: &mut dyn FnMut(Progress),
-) -> Option<Working<'a>> {
-    let empty = Working::new(photos, cameras, tracks, options);
-    let open = empty.has_open_focals();
+) -> Option<GrowingModel<'a>> {
+    let empty = GrowingModel::new(photos, cameras, tracks, options);
+    let guessed_focals = empty.has_guessed_focals();
     let few = photos.len() <= FEW_PHOTOS;
     // Whether the model must also explain enough observations.
-    let is_doubtful = |model: &Working| open || few || model.is_far_from_first_focals();
-    let mut in_doubt = open || few;
-    let mut best: Option<(Working, Vec<usize>)> = None;
-    let mut outcomes: Vec<Outcome> = Vec::new();
-    let mut left = SEEDS;
-    for seed in seeds(pairs, taken, CANDIDATES) {
-        if left == 0 {
+    let is_doubtful = |model: &GrowingModel| guessed_focals || few || model.is_far_from_initial_focals();
+    let mut is_any_doubtful = guessed_focals || few;
+    let mut best: Option<(GrowingModel, Vec<usize>)> = None;
+    let mut outcomes: Vec<SeedOutcome> = Vec::new();
+    let mut seeds_left = MAX_SEEDS;
+    for seed in seeds(pairs, assigned, MAX_SEED_CANDIDATES) {
+        if seeds_left == 0 {
             break;
         }
         // Two earlier seeds led to the same model, which contains this seed: it would lead there once more. 984 frames of two films of
         // a brick car, whose models explain 0.74 of their observations, used up all seeds, a minute each, and ended as the second.
-        let holding: Vec<&Outcome> = (outcomes.iter())
-            .filter(|outcome| outcome.holds(&pairs[seed]))
+        let containing: Vec<&SeedOutcome> = (outcomes.iter())
+            .filter(|outcome| outcome.contains_pair(&pairs[seed]))
             .collect();
-        if (1..holding.len()).any(|i| holding[..i].iter().any(|other| holding[i].is_like(other))) {
+        if (1..containing.len()).any(|i| containing[..i].iter().any(|other| containing[i].is_similar(other))) {
             continue;
         }
-        left -= 1;
-        let reachable = reachable(&pairs[seed], pairs, taken);
+        seeds_left -= 1;
+        let reachable = reachable(&pairs[seed], pairs, assigned);
         if best
             .as_ref()
             .is_some_and(|(best, _)| best.registered() >= reachable && !is_doubtful(best))
@@ -82,24 +82,24 @@ pub(super) fn model<'a>(
         }
         let mut grown = empty.clone();
         let mut failures = vec![0; photos.len()];
-        if !grown.start(&pairs[seed]) || !grown.grow(taken, &mut failures, progress) {
+        if !grown.initialize(&pairs[seed]) || !grown.grow(assigned, &mut failures, progress) {
             continue;
         }
         // If photographs were cropped off centre, no seed explains more while principal points are held at the centre: fox, with each
         // photograph cropped at a different position, took all seeds and 88 s to be mapped, and now takes 9 s.
-        if open && grown.explained_fraction() <= EXPLAINED {
+        if guessed_focals && grown.explained_fraction() <= MIN_EXPLAINED_FRACTION {
             let mut free = grown.clone();
             free.free_principal_points();
-            free.settle_fully(progress);
-            free.grow(taken, &mut failures, progress);
-            if free.explained_fraction() > EXPLAINED && free.registered() >= grown.registered() {
+            free.refine_fully(progress);
+            free.grow(assigned, &mut failures, progress);
+            if free.explained_fraction() > MIN_EXPLAINED_FRACTION && free.registered() >= grown.registered() {
                 grown = free;
             }
         }
         let doubtful = is_doubtful(&grown);
-        outcomes.push(Outcome::of(&grown, doubtful));
-        in_doubt |= doubtful;
-        let size = |model: &Working| match in_doubt {
+        outcomes.push(SeedOutcome::new(&grown, doubtful));
+        is_any_doubtful |= doubtful;
+        let size = |model: &GrowingModel| match is_any_doubtful {
             true => model.used_count(),
             false => model.registered(),
         };
@@ -108,57 +108,58 @@ pub(super) fn model<'a>(
         {
             best = Some((grown, failures));
         }
-        let suffices = |best: &Working| {
-            2 * best.registered() > reachable && (!is_doubtful(best) || best.explained_fraction() > EXPLAINED)
+        let is_sufficient = |best: &GrowingModel| {
+            2 * best.registered() > reachable
+                && (!is_doubtful(best) || best.explained_fraction() > MIN_EXPLAINED_FRACTION)
         };
-        if best.as_ref().is_some_and(|(best, _)| suffices(best)) {
+        if best.as_ref().is_some_and(|(best, _)| is_sufficient(best)) {
             break;
         }
     }
     let (best, failures) = best?;
-    for (total, failed) in tried.iter_mut().zip(failures) {
+    for (total, failed) in failed_registrations.iter_mut().zip(failures) {
         *total += failed;
     }
     Some(best)
 }
 
 /// The model to which a seed led.
-struct Outcome {
+struct SeedOutcome {
     /// `[photos]` whether each has a pose.
     posed: Vec<bool>,
     /// `[groups]` focal lengths of cameras with photographs, px; empty if the model is not in doubt.
     focals: Vec<Option<f64>>,
 }
 
-impl Outcome {
-    fn of(model: &Working, in_doubt: bool) -> Self {
-        let groups = 0..if in_doubt { model.cameras.len() } else { 0 };
-        let focal = |group| (model.registered_of(group) > 0).then(|| model.cameras[group].focal());
+impl SeedOutcome {
+    fn new(model: &GrowingModel, is_doubtful: bool) -> Self {
+        let groups = 0..if is_doubtful { model.cameras.len() } else { 0 };
+        let focal = |group| (model.registered_in_group(group) > 0).then(|| model.cameras[group].focal());
         Self {
             posed: model.poses.iter().map(Option::is_some).collect(),
             focals: groups.map(focal).collect(),
         }
     }
 
-    fn holds(&self, pair: &VerifiedPair) -> bool {
+    fn contains_pair(&self, pair: &VerifiedPair) -> bool {
         pair.photos.iter().all(|photo| self.posed[*photo as usize])
     }
 
-    fn is_like(&self, other: &Self) -> bool {
+    fn is_similar(&self, other: &Self) -> bool {
         let both = self.focals.iter().zip(&other.focals).filter_map(|(a, b)| (*a).zip(*b));
-        both.into_iter().all(|(a, b)| are_alike(a, b))
+        both.into_iter().all(|(a, b)| are_similar(a, b))
     }
 }
 
 /// Number of photographs that chains of pairs connect with the seed.
-fn reachable(seed: &VerifiedPair, pairs: &[VerifiedPair], taken: &[bool]) -> usize {
-    let mut reached = vec![false; taken.len()];
+fn reachable(seed: &VerifiedPair, pairs: &[VerifiedPair], assigned: &[bool]) -> usize {
+    let mut reached = vec![false; assigned.len()];
     reached[seed.photos[0] as usize] = true;
     loop {
         let mut grew = false;
         for pair in pairs {
             let [a, b] = pair.photos.map(|p| p as usize);
-            if !taken[a] && !taken[b] && reached[a] != reached[b] {
+            if !assigned[a] && !assigned[b] && reached[a] != reached[b] {
                 (reached[a], reached[b], grew) = (true, true, true);
             }
         }
@@ -168,82 +169,97 @@ fn reachable(seed: &VerifiedPair, pairs: &[VerifiedPair], taken: &[bool]) -> usi
     }
 }
 
-impl Working<'_> {
+impl GrowingModel<'_> {
     /// Places the two photographs of a seed and their points; `false` if too few remain.
-    fn start(&mut self, pair: &VerifiedPair) -> bool {
+    fn initialize(&mut self, pair: &VerifiedPair) -> bool {
         let [a, b] = pair.photos.map(|p| p as usize);
-        self.place(a, DPose::IDENTITY);
-        self.place(
+        self.set_pose(a, DPose::IDENTITY);
+        self.set_pose(
             b,
             DPose::from_camera_from_world(pair.motion.rotation, pair.motion.translation),
         );
         let tracks = self.tracks_of_rig(a);
         self.triangulate(&tracks);
         self.adjust_all(Extent::Growing);
-        let points = self.with_points();
+        let points = self.triangulated_tracks();
         self.filter(&points);
-        self.point_count() >= SEED_POINTS
+        self.point_count() >= MIN_SEED_POINTS
     }
 
     /// Registers photographs as long as that succeeds, then adjusts everything; `false` if the model is left with too few photographs.
-    pub(super) fn grow(&mut self, taken: &[bool], failures: &mut [usize], progress: &mut dyn FnMut(Progress)) -> bool {
+    pub(super) fn grow(
+        &mut self,
+        assigned: &[bool],
+        failures: &mut [usize],
+        progress: &mut dyn FnMut(Progress),
+    ) -> bool {
         let (mut photos_then, mut points_then) = (self.registered(), self.point_count());
-        let mut settled = false;
+        let mut refined = false;
         loop {
-            let next = self.candidates(taken, failures).into_iter().find(|photo| {
-                let registered = self.register(*photo, if settled { LENIENT } else { STRICT });
-                failures[*photo] += usize::from(!registered && settled);
-                registered
-            });
+            let next = self
+                .registration_candidates(assigned, failures)
+                .into_iter()
+                .find(|photo| {
+                    let registered = self.register(
+                        *photo,
+                        if refined {
+                            LENIENT_INLIER_RATIO
+                        } else {
+                            STRICT_INLIER_RATIO
+                        },
+                    );
+                    failures[*photo] += usize::from(!registered && refined);
+                    registered
+                });
             let Some(photo) = next else {
-                if settled {
+                if refined {
                     break;
                 }
                 // What failed before may succeed after a global adjustment.
-                self.settle(Extent::Growing, progress);
-                (photos_then, points_then, settled) = (self.registered(), self.point_count(), true);
+                self.refine_globally(Extent::Growing, progress);
+                (photos_then, points_then, refined) = (self.registered(), self.point_count(), true);
                 continue;
             };
-            settled = false;
+            refined = false;
             let tracks = self.tracks_of_rig(photo);
             self.triangulate(&tracks);
             let growth = self.options.global_growth;
             let (photos, points) = (self.registered(), self.point_count());
             if photos as f64 >= growth * photos_then as f64 || points as f64 >= growth * points_then as f64 {
-                self.settle(Extent::Growing, progress);
+                self.refine_globally(Extent::Growing, progress);
                 (photos_then, points_then) = (self.registered(), self.point_count());
             } else {
                 self.adjust_around(photo);
             }
             progress(Progress::Registered {
                 photos: self.registered(),
-                of: self.photos.len(),
+                total: self.photos.len(),
                 points: self.point_count(),
             });
         }
-        self.settle_fully(progress);
+        self.refine_fully(progress);
         self.registered() >= self.options.min_model_photos
     }
 
     /// Adjusts everything with the full lens until hardly any observation changes, then once more until convergence.
-    pub(super) fn settle_fully(&mut self, progress: &mut dyn FnMut(Progress)) {
-        for _ in 0..LAST_ROUNDS {
-            let changed = self.settle(Extent::Full, progress);
+    pub(super) fn refine_fully(&mut self, progress: &mut dyn FnMut(Progress)) {
+        for _ in 0..MAX_FINAL_ROUNDS {
+            let changed = self.refine_globally(Extent::Full, progress);
             let observations = self.used_count();
             if (changed as f64) < 1e-3 * observations as f64 {
                 break;
             }
         }
-        self.settle(Extent::Last, progress);
+        self.refine_globally(Extent::Final, progress);
     }
 
     /// Adjusts everything, filters, triangulates again and removes photographs that lost their points. Returns the number of
     /// observations that changed.
-    fn settle(&mut self, extent: Extent, progress: &mut dyn FnMut(Progress)) -> usize {
+    fn refine_globally(&mut self, extent: Extent, progress: &mut dyn FnMut(Progress)) -> usize {
         self.adjust_all(extent);
-        let points = self.with_points();
+        let points = self.triangulated_tracks();
         let mut changed = self.filter(&points);
-        if extent != Extent::Last {
+        if extent != Extent::Final {
             let all: Vec<usize> = (0..self.tracks.len()).collect();
             changed += self.triangulate(&all);
         }
@@ -262,9 +278,9 @@ impl Working<'_> {
     }
 
     /// Photographs to register, best first: those that show many points of the model, spread over the photograph.
-    fn candidates(&self, taken: &[bool], failures: &[usize]) -> Vec<usize> {
+    fn registration_candidates(&self, assigned: &[bool], failures: &[usize]) -> Vec<usize> {
         let mut scored: Vec<(usize, usize)> = (0..self.poses.len())
-            .filter(|p| self.poses[*p].is_none() && !taken[*p] && failures[*p] < TRIES)
+            .filter(|p| self.poses[*p].is_none() && !assigned[*p] && failures[*p] < MAX_REGISTRATION_ATTEMPTS)
             .filter_map(|photo| {
                 let (count, score) = self.visibility(photo);
                 (count >= self.options.min_registration_inliers).then_some((score, photo))
@@ -328,38 +344,38 @@ impl Working<'_> {
             confidence: 0.9999,
             seed: photo as u64,
         };
-        let solved = |longer: f64| {
-            let projections = at.iter().map(|at| *at / longer).zip(points.iter().copied());
+        let solved = |factor: f64| {
+            let projections = at.iter().map(|at| *at / factor).zip(points.iter().copied());
             let problem = Resection::new(
                 projections.collect(),
-                self.options.max_registration_error / (focal * longer),
+                self.options.max_registration_error / (focal * factor),
             );
             let found = problem.solve(Vec::new(), limits)?;
-            Some((longer, problem, found))
+            Some((factor, problem, found))
         };
-        let least = self.options.min_registration_inliers as f64;
-        let agrees = |found: &Estimate<DPose>| found.inliers as f64 >= least.max(ratio * seen.len() as f64);
+        let min_inliers = self.options.min_registration_inliers as f64;
+        let agrees = |found: &Estimate<DPose>| found.inliers as f64 >= min_inliers.max(ratio * seen.len() as f64);
         let group = self.photos[photo].group;
-        let first = self.registered_of(group) == 0 && !self.held_cameras[group];
-        let mut found = if first && self.sources[group] == Source::Guess {
+        let is_first = self.registered_in_group(group) == 0 && !self.held_cameras[group];
+        let mut found = if is_first && self.sources[group] == FocalSource::Guess {
             None
         } else {
             solved(1.0).filter(|(.., found)| agrees(found))
         };
         // The metadata of a photograph that was cropped later are wrong.
-        if found.is_none() && first {
-            let any = FOCALS.into_iter().filter_map(solved);
+        if found.is_none() && is_first {
+            let any = FOCAL_FACTORS.into_iter().filter_map(solved);
             let best = any.min_by(|(.., a), (.., b)| a.cost.total_cmp(&b.cost));
-            let between = |longer: f64| longer > FOCALS[0] && longer < FOCALS[FOCALS.len() - 1];
-            found = best.filter(|(longer, _, found)| between(*longer) && agrees(found));
+            let is_inside = |factor: f64| factor > FOCAL_FACTORS[0] && factor < FOCAL_FACTORS[FOCAL_FACTORS.len() - 1];
+            found = best.filter(|(factor, _, found)| is_inside(*factor) && agrees(found));
         }
-        let Some((longer, problem, found)) = found else {
+        let Some((factor, problem, found)) = found else {
             return false;
         };
-        if longer != 1.0 {
-            self.scale_focal(group, longer);
+        if factor != 1.0 {
+            self.scale_focal(group, factor);
         }
-        self.place(photo, found.model);
+        self.set_pose(photo, found.model);
         for (o, inlier) in seen.iter().zip(problem.inliers(&found.model)) {
             self.used[*o as usize] = inlier;
         }
@@ -373,14 +389,14 @@ mod tests {
 
     #[test]
     fn models_are_alike_where_cameras_of_both_have_one_focal_length() {
-        let of = |focals: &[Option<f64>]| Outcome {
+        let of = |focals: &[Option<f64>]| SeedOutcome {
             posed: Vec::new(),
             focals: focals.to_vec(),
         };
         let model = of(&[Some(1164.0), Some(1242.0), None]);
-        assert!(model.is_like(&of(&[Some(1160.0), Some(1239.0), Some(900.0)])));
-        assert!(!model.is_like(&of(&[Some(1160.0), Some(1300.0), None])));
-        assert!(!of(&[Some(9300.0)]).is_like(&of(&[Some(8446.0)])));
-        assert!(of(&[]).is_like(&of(&[])), "no doubt");
+        assert!(model.is_similar(&of(&[Some(1160.0), Some(1239.0), Some(900.0)])));
+        assert!(!model.is_similar(&of(&[Some(1160.0), Some(1300.0), None])));
+        assert!(!of(&[Some(9300.0)]).is_similar(&of(&[Some(8446.0)])));
+        assert!(of(&[]).is_similar(&of(&[])), "no doubt");
     }
 }

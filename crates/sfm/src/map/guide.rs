@@ -4,36 +4,36 @@
 //! are wrong. A point on which three photographs agree is correct; a point of two photographs is accepted if points beside it, in both
 //! photographs, have a similar depth.
 
-use super::focal::Source;
-use super::model::Working;
+use super::focal::FocalSource;
+use super::model::GrowingModel;
 use super::tracks::Tracks;
-use super::types::{Known, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, VerifiedPair};
-use super::verify::to_plane;
+use super::types::{KnownGeometry, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, VerifiedPair};
+use super::verify::inverse_calibration;
 use super::{finish, verify};
 use crate::geometry::camera::DCamera;
 use crate::geometry::essential::Motion;
 use crate::geometry::pose::DPose;
-use crate::matching::{MatchOptions, TwoView, match_guided};
+use crate::matching::{MatchOptions, TwoViewGeometry, match_guided};
 use crate::{Features, Keypoint};
 use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 use std::collections::HashSet;
 
 /// Maximum distance of a match from its epipolar line, px: small, because the poses are known.
-const OFF_LINE: f64 = 1.0;
+const MAX_LINE_DISTANCE_PIXELS: f64 = 1.0;
 /// [`MatchOptions::ratio`] for matches along lines.
-const RATIO: f32 = 0.75;
+const MATCH_RATIO: f32 = 0.75;
 /// Maximum angle between the axes of photographs that are matched, degrees.
-const WIDEST: f64 = 70.0;
+const MAX_AXIS_ANGLE_DEGREES: f64 = 70.0;
 /// Minimum number of photographs of a point that is accepted without points beside it.
-const CERTAIN: usize = 3;
+const MIN_CERTAIN_PHOTOS: usize = 3;
 /// Points beside another are within this distance of it, relative to the photograph's longer side; how many of the nearest ones are used
 /// at most, and how many are needed to predict its depth.
-const BESIDE: f64 = 0.1;
-const NEAREST: usize = 5;
-const FEWEST: usize = 3;
+const NEIGHBOUR_RADIUS: f64 = 0.1;
+const MAX_NEIGHBOURS: usize = 5;
+const MIN_NEIGHBOURS: usize = 3;
 /// The fraction by which a depth may be outside the range of the depths beside it.
-const SLACK: f64 = 0.1;
+const DEPTH_TOLERANCE: f64 = 0.1;
 
 /// Adds points to `model`, which was made from `photos`, `features` and `pairs`. Existing points are replaced by those of three or more
 /// photographs that share an observation with them; cameras and poses stay as they are.
@@ -51,23 +51,28 @@ pub fn add_guided_points(
     let guided = guided_pairs(photos, features, model);
     let tracks = Tracks::complete(features, &[&guided, pairs].concat());
     // Groups without a camera have no photograph in the model.
-    let camera = |camera: &Option<DCamera>| (camera.unwrap_or(DCamera::centered(1, 1, 1.0)), Source::Prior);
+    let camera = |camera: &Option<DCamera>| (camera.unwrap_or(DCamera::centered(1, 1, 1.0)), FocalSource::Prior);
     let cameras: verify::Cameras = model.cameras.iter().map(camera).collect();
-    let mut working = Working::new(photos, &cameras, &tracks, options);
-    working.hold(&Known::from(&*model));
-    let found = finish::collected(&working, photos).points;
-    let (certain, of_two): (Vec<_>, Vec<_>) = found.into_iter().partition(|point| point.track.len() >= CERTAIN);
+    let mut working = GrowingModel::new(photos, &cameras, &tracks, options);
+    working.hold(&KnownGeometry::from(&*model));
+    let found = finish::extract_model(&working, photos).points;
+    let (certain, of_two): (Vec<_>, Vec<_>) = found
+        .into_iter()
+        .partition(|point| point.track.len() >= MIN_CERTAIN_PHOTOS);
     let before = std::mem::replace(&mut model.points, certain);
-    let new = unseen(&model.points, before);
+    let new = without_shared_observations(&model.points, before);
     model.points.extend(new);
     let depths = known_depths(photos, features, model);
-    let agrees = |point: &ModelPoint| agrees(point, photos, features, model, &depths);
-    let new: Vec<ModelPoint> = unseen(&model.points, of_two).into_iter().filter(agrees).collect();
+    let is_consistent = |point: &ModelPoint| has_consistent_depth(point, photos, features, model, &depths);
+    let new: Vec<ModelPoint> = without_shared_observations(&model.points, of_two)
+        .into_iter()
+        .filter(is_consistent)
+        .collect();
     model.points.extend(new);
 }
 
 /// Those of `more` that share no observation with `points`.
-fn unseen(points: &[ModelPoint], more: Vec<ModelPoint>) -> Vec<ModelPoint> {
+fn without_shared_observations(points: &[ModelPoint], more: Vec<ModelPoint>) -> Vec<ModelPoint> {
     let seen: HashSet<&(u32, u32)> = points.iter().flat_map(|point| &point.track).collect();
     more.into_iter()
         .filter(|point| !point.track.iter().any(|observation| seen.contains(observation)))
@@ -75,7 +80,7 @@ fn unseen(points: &[ModelPoint], more: Vec<ModelPoint>) -> Vec<ModelPoint> {
 }
 
 /// A photograph of the model as if taken by a pinhole camera.
-struct Ideal {
+struct PinholePhoto {
     photo: u32,
     pose: DPose,
     /// From pixels to the plane z = 1.
@@ -83,7 +88,7 @@ struct Ideal {
     features: Features,
 }
 
-impl Ideal {
+impl PinholePhoto {
     fn new(photo: usize, features: &Features, camera: &DCamera, pose: DPose) -> Self {
         let [fx, fy, cx, cy, ..] = camera.parameters;
         let place = |keypoint: &Keypoint| {
@@ -98,7 +103,7 @@ impl Ideal {
         Self {
             photo: photo as u32,
             pose,
-            inverse: to_plane(camera),
+            inverse: inverse_calibration(camera),
             features: Features {
                 keypoints: features.keypoints.iter().map(place).collect(),
                 descriptors: features.descriptors.clone(),
@@ -116,16 +121,16 @@ impl Ideal {
 
 /// The matches along epipolar lines, in front of both cameras, of all pairs of the model's photographs that look in similar directions.
 fn guided_pairs(photos: &[PhotoInfo], features: &[Features], model: &Model) -> Vec<VerifiedPair> {
-    let ideal = |photo: usize| {
+    let pinhole = |photo: usize| {
         let camera = model.cameras[photos[photo].group].as_ref()?;
-        Some(Ideal::new(photo, &features[photo], camera, model.poses[photo]?))
+        Some(PinholePhoto::new(photo, &features[photo], camera, model.poses[photo]?))
     };
-    let posed: Vec<Ideal> = (0..photos.len()).into_par_iter().filter_map(ideal).collect();
+    let posed: Vec<PinholePhoto> = (0..photos.len()).into_par_iter().filter_map(pinhole).collect();
     let options = MatchOptions {
-        ratio: RATIO,
+        ratio: MATCH_RATIO,
         ..MatchOptions::default()
     };
-    let all: Vec<[&Ideal; 2]> = posed
+    let all: Vec<[&PinholePhoto; 2]> = posed
         .iter()
         .enumerate()
         .flat_map(|(i, a)| posed[i + 1..].iter().map(move |b| [a, b]))
@@ -136,17 +141,17 @@ fn guided_pairs(photos: &[PhotoInfo], features: &[Features], model: &Model) -> V
 }
 
 /// The matches of one pair; `None` for photographs taken from one place, or in directions that differ too much.
-fn guided_pair([a, b]: [&Ideal; 2], options: &MatchOptions) -> Option<VerifiedPair> {
-    let [toward_a, toward_b] = [a, b].map(|photo| photo.pose.rotation * DVec3::Z);
-    if toward_a.dot(toward_b) < WIDEST.to_radians().cos() {
+fn guided_pair([a, b]: [&PinholePhoto; 2], options: &MatchOptions) -> Option<VerifiedPair> {
+    let [axis_a, axis_b] = [a, b].map(|photo| photo.pose.rotation * DVec3::Z);
+    if axis_a.dot(axis_b) < MAX_AXIS_ANGLE_DEGREES.to_radians().cos() {
         return None;
     }
     let motion = Motion {
         rotation: (b.pose.rotation.inverse() * a.pose.rotation).normalize(),
         translation: b.pose.camera_from_world(a.pose.position).try_normalize()?,
     };
-    let lines = TwoView::Fundamental(b.inverse.transpose() * motion.essential() * a.inverse);
-    let mut matches = match_guided(&a.features, &b.features, &lines, OFF_LINE, options);
+    let lines = TwoViewGeometry::Fundamental(b.inverse.transpose() * motion.essential() * a.inverse);
+    let mut matches = match_guided(&a.features, &b.features, &lines, MAX_LINE_DISTANCE_PIXELS, options);
     matches.retain(|[i, j]| {
         motion
             .depths([a.on_plane(*i), b.on_plane(*j)])
@@ -159,7 +164,7 @@ fn guided_pair([a, b]: [&Ideal; 2], options: &MatchOptions) -> Option<VerifiedPa
         kind: PairKind::General,
         motion,
         // The angle between the axes: tracks only use the matches.
-        angle: toward_a.angle_between(toward_b),
+        angle: axis_a.angle_between(axis_b),
     })
 }
 
@@ -168,7 +173,7 @@ fn known_depths(photos: &[PhotoInfo], features: &[Features], model: &Model) -> V
     let mut depths = vec![Vec::new(); photos.len()];
     for point in &model.points {
         for observation in &point.track {
-            let known = seen_at(point, *observation, features, model);
+            let known = position_and_depth(point, *observation, features, model);
             depths[observation.0 as usize].extend(known);
         }
     }
@@ -176,7 +181,7 @@ fn known_depths(photos: &[PhotoInfo], features: &[Features], model: &Model) -> V
 }
 
 /// The position at which a photograph shows `point`, px, and its depth.
-fn seen_at(
+fn position_and_depth(
     point: &ModelPoint,
     (photo, keypoint): (u32, u32),
     features: &[Features],
@@ -188,7 +193,7 @@ fn seen_at(
 }
 
 /// Whether the depth of `point` is within the range of the points beside it in each photograph.
-fn agrees(
+fn has_consistent_depth(
     point: &ModelPoint,
     photos: &[PhotoInfo],
     features: &[Features],
@@ -197,21 +202,21 @@ fn agrees(
 ) -> bool {
     point.track.iter().all(|observation| {
         let photo = &photos[observation.0 as usize];
-        let Some((at, depth)) = seen_at(point, *observation, features, model) else {
+        let Some((at, depth)) = position_and_depth(point, *observation, features, model) else {
             return false;
         };
-        let reach = BESIDE * f64::from(photo.width.max(photo.height));
-        let mut beside: Vec<(f64, f64)> = depths[observation.0 as usize]
+        let radius = NEIGHBOUR_RADIUS * f64::from(photo.width.max(photo.height));
+        let mut neighbours: Vec<(f64, f64)> = depths[observation.0 as usize]
             .iter()
             .map(|(other, depth)| (other.distance_squared(at), *depth))
-            .filter(|(distance2, _)| *distance2 < reach * reach)
+            .filter(|(distance2, _)| *distance2 < radius * radius)
             .collect();
-        beside.sort_by(|a, b| a.0.total_cmp(&b.0));
-        beside.truncate(NEAREST);
-        let range = beside.iter().fold([f64::INFINITY, 0.0], |[low, high], (_, depth)| {
+        neighbours.sort_by(|a, b| a.0.total_cmp(&b.0));
+        neighbours.truncate(MAX_NEIGHBOURS);
+        let range = neighbours.iter().fold([f64::INFINITY, 0.0], |[low, high], (_, depth)| {
             [depth.min(low), depth.max(high)]
         });
-        let within = range[0] * (1.0 - SLACK)..range[1] * (1.0 + SLACK);
-        beside.len() >= FEWEST && within.contains(&depth)
+        let within = range[0] * (1.0 - DEPTH_TOLERANCE)..range[1] * (1.0 + DEPTH_TOLERANCE);
+        neighbours.len() >= MIN_NEIGHBOURS && within.contains(&depth)
     })
 }

@@ -4,9 +4,7 @@
 //! models from seed pairs (`grow`), adjusting as they grow (`refine`). Matches that stand still while others move are left out (`still`).
 //! The result depends only on the input, not on clocks, threads or hash order.
 
-mod absent;
-mod agree;
-mod apart;
+mod agreement;
 mod distance;
 mod finish;
 mod fisheye;
@@ -14,12 +12,14 @@ mod focal;
 mod grow;
 mod guide;
 mod metric;
+mod missing;
 mod model;
 mod observable;
 mod principal;
 mod readjust;
 mod refine;
 mod seed;
+mod split;
 mod still;
 mod tracks;
 mod triangulation;
@@ -29,40 +29,40 @@ mod unfold;
 mod verify;
 mod zoom;
 
-pub use absent::{ABSENT_PAIRS, absent};
-pub(crate) use agree::on_planes;
-pub use agree::{agreement, contradictions, strengths, telling};
-pub use distance::{Distance, DistanceFit, to_distances};
-pub use focal::Source;
+pub(crate) use agreement::normalized_matches;
+pub use agreement::{agreement, contradictions, evidence_pairs, strengths};
+pub use distance::{Distance, DistanceFit, scale_to_distances};
+pub use focal::FocalSource;
 pub use guide::add_guided_points;
-pub use metric::{Metric, to_metres};
+pub use metric::{ScaleFit, scale_to_locations};
+pub use missing::{MIN_MISSING_PAIRS, missing_matches};
 pub use observable::determines_focal;
-pub(crate) use still::{AGREES, limits, showing};
-pub use still::{StandsStill, moving, same_place, stands_still};
-pub use turntable::turntable;
+pub(crate) use still::{MAX_INLIER_ERROR, pairs_with_value, ransac_limits};
+pub use still::{StillRegion, duplicate_pairs, find_still_region, moving_matches};
+pub use turntable::turntable_rings;
 pub(crate) use types::rigs;
 pub use types::{
-    Absent, FEW_PHOTOS, Known, LeftOut, MapOptions, Model, ModelPoint, Mount, PairKind, PhotoInfo, Progress, Reason,
-    Reconstruction, VerifiedPair, Zoom,
+    FEW_PHOTOS, KnownGeometry, LeftOut, MapOptions, MissingMatches, Model, ModelPoint, PairKind, PhotoInfo, Progress,
+    Reason, Reconstruction, RigMount, VerifiedPair, Zoom,
 };
 pub(crate) use verify::centered_points;
 pub use verify::{Cameras, verify};
 
 use crate::geometry::camera::DCamera;
 use crate::{Features, PairMatches};
-use apart::Parted;
+use split::Split;
 use tracks::Tracks;
-use zoom::Focals;
+use zoom::FocalDistribution;
 
 /// A model with less than this fraction of the photographs is in doubt, and is mapped again with this focal length, relative to the long
 /// side. Models of a rendered medal with a field of view of 14 degrees are correct with initial values of 2, 3, 4 and 6, and wrong from
 /// 0.5 (the value from its pairs) to 1.2.
-const IN_DOUBT: f64 = 0.8;
-const NARROW: f64 = 3.0;
+const MIN_TRUSTED_FRACTION: f64 = 0.8;
+const NARROW_VIEW_FOCAL: f64 = 3.0;
 /// Maximum number of zoom settings that are distinguished besides the first.
-const MOST_ZOOMS: usize = 3;
+const MAX_ZOOMS: usize = 3;
 /// Maximum mean error of a model in which each photograph has its own focal length, relative to that of the model with shared ones.
-const OWN_ERROR: f64 = 0.8;
+const MAX_ERROR_RATIO: f64 = 0.8;
 
 /// Cameras, poses and points from matched features.
 ///
@@ -79,32 +79,32 @@ pub fn reconstruct(
     progress: &mut dyn FnMut(Progress),
 ) -> Reconstruction {
     assert_eq!(photos.len(), features.len(), "one set of features per photograph");
-    let pairs = &still::without(photos, features, pairs)[..];
+    let pairs = &still::without_still_matches(photos, features, pairs)[..];
     let mut known = known_cameras(photos);
-    let mut found = mapped(photos, features, pairs, &known, options, progress);
+    let mut found = map_with_cameras(photos, features, pairs, &known, options, progress);
     // The focal length that the pairs of few photographs suggest may be wrong, and so may a model that starts with it.
     if photos.len() <= FEW_PHOTOS
-        && let Some(usual) = usual(photos, &found.cameras)
+        && let Some(usual) = with_usual_focal(photos, &found.cameras)
     {
-        let again = mapped(photos, features, pairs, &usual, options, progress);
-        if again.apart.is_none() && explained(&again) > explained(&found) {
+        let again = map_with_cameras(photos, features, pairs, &usual, options, progress);
+        if again.split_models.is_none() && model_size(&again) > model_size(&found) {
             found = again;
             known = usual;
         }
     }
-    let in_doubt = found.apart.is_some()
-        || (found.registered() as f64) < IN_DOUBT * photos.len() as f64
-        || is_far_from_first_focals(&found);
+    let is_doubtful = found.split_models.is_some()
+        || (found.registered() as f64) < MIN_TRUSTED_FRACTION * photos.len() as f64
+        || is_far_from_initial_focals(&found);
     if options.narrow
-        && in_doubt
+        && is_doubtful
         && !zoom::is_confirmed(photos, features, &found.models)
-        && let Some(narrow) = narrow(photos, &found.cameras)
+        && let Some(narrow) = with_narrow_view(photos, &found.cameras)
     {
-        let again = mapped(photos, features, pairs, &narrow, options, progress);
+        let again = map_with_cameras(photos, features, pairs, &narrow, options, progress);
         // Parts that look alike are joined with any focal length, so contradictions decide as well.
         let contradicted = |found: &Reconstruction| found.contradictions(photos, features);
-        let more = explained(&again) > explained(&found);
-        if again.apart.is_none() && more && contradicted(&again) <= contradicted(&found) {
+        let more = model_size(&again) > model_size(&found);
+        if again.split_models.is_none() && more && contradicted(&again) <= contradicted(&found) {
             found = again;
             known = narrow;
         }
@@ -112,51 +112,57 @@ pub fn reconstruct(
     let fisheyes = found.models.first().map(|model| fisheye::find(photos, features, model));
     if let Some(fisheyes) = fisheyes.filter(|fisheyes| !fisheyes.is_empty()) {
         for (group, camera) in fisheyes {
-            known[group] = Some((camera, Source::Pairs));
+            known[group] = Some((camera, FocalSource::Pairs));
         }
-        let again = mapped(photos, features, pairs, &known, options, progress);
-        if explained(&again) > explained(&found) {
+        let again = map_with_cameras(photos, features, pairs, &known, options, progress);
+        if model_size(&again) > model_size(&found) {
             found = again;
         }
     }
     let mut grouped = photos.to_vec();
-    while found.zooms.len() < MOST_ZOOMS {
-        let within = match found.models.first().map(|m| zoom::find(&grouped, features, m)) {
-            Some(Focals::Own) if found.zooms.is_empty() => {
+    while found.zooms.len() < MAX_ZOOMS {
+        let clustered = match found
+            .models
+            .first()
+            .map(|m| zoom::focal_distribution(&grouped, features, m))
+        {
+            Some(FocalDistribution::Own) if found.zooms.is_empty() => {
                 let own = with_own_focals(photos, features, pairs, &found, options, progress);
                 found = own.unwrap_or(found);
                 break;
             }
-            Some(Focals::Parted(zoom)) => Some(zoom),
+            Some(FocalDistribution::Clustered(zoom)) => Some(zoom),
             _ => None,
         };
-        let Some(zoom) = within.or_else(|| zoom::between(&grouped, &found.models)) else {
+        let Some(zoom) = clustered.or_else(|| zoom::between_models(&grouped, &found.models)) else {
             break;
         };
-        let mut apart = grouped.clone();
-        zoom.photos.iter().for_each(|photo| apart[*photo].group = zoom.group);
+        let mut regrouped = grouped.clone();
+        zoom.photos
+            .iter()
+            .for_each(|photo| regrouped[*photo].group = zoom.group);
         let mut cameras: Vec<_> = found.cameras.iter().copied().map(Some).collect();
-        let lens = cameras[zoom.of].expect("listed").0;
+        let lens = cameras[zoom.previous_group].expect("listed").0;
         cameras.push(None);
-        for (group, focal) in [zoom.of, zoom.group].into_iter().zip(zoom.focals) {
-            cameras[group] = Some((DCamera::centered(lens.width, lens.height, focal), Source::Pairs));
+        for (group, focal) in [zoom.previous_group, zoom.group].into_iter().zip(zoom.focals) {
+            cameras[group] = Some((DCamera::centered(lens.width, lens.height, focal), FocalSource::Pairs));
         }
-        let again = mapped(&apart, features, pairs, &cameras, options, progress);
-        if again.registered() < found.registered() || !zoom::holds(&zoom, &again.models) {
+        let again = map_with_cameras(&regrouped, features, pairs, &cameras, options, progress);
+        if again.registered() < found.registered() || !zoom::is_distinct(&zoom, &again.models) {
             break;
         }
         let zooms = [std::mem::take(&mut found.zooms), vec![zoom]].concat();
         found = Reconstruction { zooms, ..again };
-        grouped = apart;
+        grouped = regrouped;
     }
     // Puts each photograph into the group of its own camera, where it has one.
     found.regroup(&mut grouped);
-    if let Some(model) = principal::freed(&grouped, features, &found, options, progress) {
+    if let Some(model) = principal::with_free_principal_points(&grouped, features, &found, options, progress) {
         found.models[0] = model;
     }
     // The focal lengths after adjustment.
     for zoom in &mut found.zooms {
-        for (focal, group) in zoom.focals.iter_mut().zip([zoom.of, zoom.group]) {
+        for (focal, group) in zoom.focals.iter_mut().zip([zoom.previous_group, zoom.group]) {
             *focal = zoom::camera(&found.models, group).map_or(*focal, DCamera::focal);
         }
     }
@@ -174,77 +180,85 @@ fn with_own_focals(
     progress: &mut dyn FnMut(Progress),
 ) -> Option<Reconstruction> {
     let shared = found.models.first()?;
-    let first = |photo: &PhotoInfo| {
+    let shared_camera = |photo: &PhotoInfo| {
         let focal = shared.cameras[photo.group].as_ref()?.focal();
-        Some((DCamera::centered(photo.width, photo.height, focal), Source::Guess))
+        Some((DCamera::centered(photo.width, photo.height, focal), FocalSource::Guess))
     };
-    let cameras: Vec<_> = photos.iter().map(first).collect();
+    let cameras: Vec<_> = photos.iter().map(shared_camera).collect();
     let each = photos.iter().cloned().enumerate();
     let each: Vec<PhotoInfo> = each.map(|(group, photo)| PhotoInfo { group, ..photo }).collect();
-    let own = mapped(&each, features, pairs, &cameras, options, progress);
+    let own = map_with_cameras(&each, features, pairs, &cameras, options, progress);
     let model = own.models.first()?;
-    let better = model.registered() >= shared.registered() && model.mean_error() < OWN_ERROR * shared.mean_error();
-    better.then_some(Reconstruction {
+    let is_better =
+        model.registered() >= shared.registered() && model.mean_error() < MAX_ERROR_RATIO * shared.mean_error();
+    is_better.then_some(Reconstruction {
         own_focals: true,
         ..own
     })
 }
 
 /// Cameras with the usual focal length, if there are no metadata and the pairs suggest another one.
-fn usual(photos: &[PhotoInfo], cameras: &Cameras) -> Option<Vec<Option<(DCamera, Source)>>> {
-    let is_guess = cameras.iter().all(|(_, source)| *source == Source::Guess);
-    guessed(photos, cameras, focal::GUESS).filter(|_| !is_guess)
+fn with_usual_focal(photos: &[PhotoInfo], cameras: &Cameras) -> Option<Vec<Option<(DCamera, FocalSource)>>> {
+    let is_guess = cameras.iter().all(|(_, source)| *source == FocalSource::Guess);
+    with_guessed_focal(photos, cameras, focal::DEFAULT_FOCAL).filter(|_| !is_guess)
 }
 
 /// Cameras with a narrow field of view, if there are no metadata: all focal lengths fit the pairs of such photographs nearly equally
 /// well, and a model that starts with a much shorter one becomes flat and breaks.
-fn narrow(photos: &[PhotoInfo], cameras: &Cameras) -> Option<Vec<Option<(DCamera, Source)>>> {
-    let shorter = |(camera, _): &(DCamera, Source)| camera.focal() < NARROW / 2.0 * camera.long_side();
-    guessed(photos, cameras, NARROW).filter(|_| cameras.iter().all(shorter))
+fn with_narrow_view(photos: &[PhotoInfo], cameras: &Cameras) -> Option<Vec<Option<(DCamera, FocalSource)>>> {
+    let shorter = |(camera, _): &(DCamera, FocalSource)| camera.focal() < NARROW_VIEW_FOCAL / 2.0 * camera.long_side();
+    with_guessed_focal(photos, cameras, NARROW_VIEW_FOCAL).filter(|_| cameras.iter().all(shorter))
 }
 
 /// `[groups]` cameras with the focal length `focal`, relative to the long side, if there are no metadata.
-fn guessed(photos: &[PhotoInfo], cameras: &Cameras, focal: f64) -> Option<Vec<Option<(DCamera, Source)>>> {
-    let told = |photo: &PhotoInfo| photo.focal_prior_px.is_some() || photo.camera.is_some();
-    if photos.iter().any(told) {
+fn with_guessed_focal(
+    photos: &[PhotoInfo],
+    cameras: &Cameras,
+    focal: f64,
+) -> Option<Vec<Option<(DCamera, FocalSource)>>> {
+    let has_metadata = |photo: &PhotoInfo| photo.focal_prior_px.is_some() || photo.camera.is_some();
+    if photos.iter().any(has_metadata) {
         return None;
     }
-    let camera = |(camera, _): &(DCamera, Source)| {
+    let camera = |(camera, _): &(DCamera, FocalSource)| {
         let focal = focal * camera.long_side();
-        Some((DCamera::centered(camera.width, camera.height, focal), Source::Guess))
+        Some((
+            DCamera::centered(camera.width, camera.height, focal),
+            FocalSource::Guess,
+        ))
     };
     Some(cameras.iter().map(camera).collect())
 }
 
 /// Whether a focal length in the largest model ended far from where it began.
-fn is_far_from_first_focals(found: &Reconstruction) -> bool {
+fn is_far_from_initial_focals(found: &Reconstruction) -> bool {
     let first = found.models.first().map_or(&[][..], |model| &model.cameras);
     let mut of_both = first.iter().zip(&found.cameras);
-    of_both.any(|(camera, (began, _))| camera.is_some_and(|c| focal::are_far(c.focal(), began.focal())))
+    of_both.any(|(camera, (began, _))| camera.is_some_and(|c| focal::are_far_apart(c.focal(), began.focal())))
 }
 
 /// Number of photographs and of observations in the largest model.
-fn explained(found: &Reconstruction) -> (usize, usize) {
+fn model_size(found: &Reconstruction) -> (usize, usize) {
     let model = found.models.first();
     model.map_or((0, 0), |model| (model.registered(), model.observations()))
 }
 
 /// `[groups]` the cameras that are known exactly.
-fn known_cameras(photos: &[PhotoInfo]) -> Vec<Option<(DCamera, Source)>> {
+fn known_cameras(photos: &[PhotoInfo]) -> Vec<Option<(DCamera, FocalSource)>> {
     let groups = photos.iter().map(|photo| photo.group + 1).max().unwrap_or(0);
     let mut cameras = vec![None; groups];
     for photo in photos {
-        cameras[photo.group] = photo.camera.map(|camera| (camera, Source::Prior));
+        cameras[photo.group] = photo.camera.map(|camera| (camera, FocalSource::Prior));
     }
     cameras
 }
 
 /// Like [`reconstruct`], with the given groups, and with the cameras of some of them given.
-fn mapped(
+fn map_with_cameras(
     photos: &[PhotoInfo],
     features: &[Features],
     pairs: &[PairMatches],
-    cameras: &[Option<(DCamera, Source)>],
+    cameras: &[Option<(DCamera, FocalSource)>],
     options: &MapOptions,
     progress: &mut dyn FnMut(Progress),
 ) -> Reconstruction {
@@ -256,10 +270,26 @@ fn mapped(
         pairs: &verified,
         options,
     };
-    let found = unfold::unfolded(&input, grown(&input, &verified, progress), progress);
-    let Parted { found, absent, apart } = apart::parted(&input, found, progress);
-    let Grown { models, taken, tried } = found;
-    let left_out = finish::left_out(photos, features, pairs, &verified, &taken, &tried, options);
+    let found = unfold::unfold(&input, grow_models(&input, &verified, progress), progress);
+    let Split {
+        found,
+        missing,
+        split_models,
+    } = split::split(&input, found, progress);
+    let GrownModels {
+        models,
+        assigned,
+        failed_registrations,
+    } = found;
+    let left_out = finish::left_out(
+        photos,
+        features,
+        pairs,
+        &verified,
+        &assigned,
+        &failed_registrations,
+        options,
+    );
     Reconstruction {
         models,
         left_out,
@@ -267,8 +297,8 @@ fn mapped(
         cameras,
         zooms: Vec::new(),
         own_focals: false,
-        absent,
-        apart,
+        missing,
+        split_models,
     }
 }
 
@@ -281,32 +311,44 @@ pub fn extend(
     photos: &[PhotoInfo],
     features: &[Features],
     pairs: &[PairMatches],
-    known: &Known,
+    known: &KnownGeometry,
     options: &MapOptions,
     progress: &mut dyn FnMut(Progress),
 ) -> Reconstruction {
     assert_eq!(photos.len(), known.poses.len(), "a pose or none per photograph");
-    let pairs = &still::without(photos, features, pairs)[..];
-    let held: Vec<_> = known.cameras.iter().map(|c| c.map(|c| (c, Source::Prior))).collect();
+    let pairs = &still::without_still_matches(photos, features, pairs)[..];
+    let held: Vec<_> = known
+        .cameras
+        .iter()
+        .map(|c| c.map(|c| (c, FocalSource::Prior)))
+        .collect();
     let (cameras, verified) = verify::verify_with(photos, features, pairs, &held, options, progress);
     assert_eq!(cameras.len(), known.cameras.len(), "a camera or none per group");
     let tracks = Tracks::new(features, &verified);
-    let mut working = model::Working::new(photos, &cameras, &tracks, options);
+    let mut working = model::GrowingModel::new(photos, &cameras, &tracks, options);
     working.hold(known);
-    let mut tried = vec![0; photos.len()];
-    working.grow(&vec![false; photos.len()], &mut tried, progress);
-    let taken: Vec<bool> = working.poses.iter().map(Option::is_some).collect();
-    let left_out = finish::left_out(photos, features, pairs, &verified, &taken, &tried, options);
-    let model = finish::collected(&working, photos);
+    let mut failed_registrations = vec![0; photos.len()];
+    working.grow(&vec![false; photos.len()], &mut failed_registrations, progress);
+    let assigned: Vec<bool> = working.poses.iter().map(Option::is_some).collect();
+    let left_out = finish::left_out(
+        photos,
+        features,
+        pairs,
+        &verified,
+        &assigned,
+        &failed_registrations,
+        options,
+    );
+    let model = finish::extract_model(&working, photos);
     Reconstruction {
-        absent: absent(photos, &model),
+        missing: missing_matches(photos, &model),
         models: vec![model],
         left_out,
         pairs: verified,
         cameras,
         zooms: Vec::new(),
         own_focals: false,
-        apart: None,
+        split_models: None,
     }
 }
 
@@ -342,13 +384,13 @@ pub fn complete(
 }
 
 /// Models, and the photographs that are in them or failed.
-struct Grown {
+struct GrownModels {
     /// Largest first.
     models: Vec<Model>,
     /// `[photos]` whether a photograph is in a model.
-    taken: Vec<bool>,
+    assigned: Vec<bool>,
     /// `[photos]` number of failed registrations.
-    tried: Vec<usize>,
+    failed_registrations: Vec<usize>,
 }
 
 /// The input from which models are grown.
@@ -362,7 +404,7 @@ struct Input<'a> {
 }
 
 /// All models from the matches of `pairs`, which may be a subset of those of `input`.
-fn grown(input: &Input, pairs: &[VerifiedPair], progress: &mut dyn FnMut(Progress)) -> Grown {
+fn grow_models(input: &Input, pairs: &[VerifiedPair], progress: &mut dyn FnMut(Progress)) -> GrownModels {
     let Input {
         photos,
         features,
@@ -372,19 +414,32 @@ fn grown(input: &Input, pairs: &[VerifiedPair], progress: &mut dyn FnMut(Progres
     } = *input;
     let tracks = Tracks::new(features, pairs);
     let mut models = Vec::new();
-    let mut taken = vec![false; photos.len()];
-    let mut tried = vec![0; photos.len()];
+    let mut assigned = vec![false; photos.len()];
+    let mut failed_registrations = vec![0; photos.len()];
     while models.len() < options.max_models {
-        let Some(model) = grow::model(photos, cameras, pairs, &tracks, &taken, &mut tried, options, progress) else {
+        let Some(model) = grow::grow_model(
+            photos,
+            cameras,
+            pairs,
+            &tracks,
+            &assigned,
+            &mut failed_registrations,
+            options,
+            progress,
+        ) else {
             break;
         };
         for (photo, pose) in model.poses.iter().enumerate() {
-            taken[photo] |= pose.is_some();
+            assigned[photo] |= pose.is_some();
         }
         models.push(model);
     }
     let mut models: Vec<Model> = models.into_iter().map(|model| finish::finish(&model, photos)).collect();
     // The sort is stable: models of equal size stay in the order of their seeds.
     models.sort_by_key(|model| std::cmp::Reverse(model.registered()));
-    Grown { models, taken, tried }
+    GrownModels {
+        models,
+        assigned,
+        failed_registrations,
+    }
 }

@@ -1,26 +1,26 @@
 //! The state of a growing model: which photographs have poses, which tracks have points, which observations agree.
 
-use super::focal::Source;
+use super::focal::FocalSource;
 use super::tracks::Tracks;
-use super::types::{Known, MapOptions, Model, PhotoInfo, rigs};
+use super::types::{KnownGeometry, MapOptions, Model, PhotoInfo, rigs};
 use super::verify::Cameras;
 use crate::geometry::camera::DCamera;
 use crate::geometry::pose::DPose;
-use crate::geometry::triangulate::Sight;
+use crate::geometry::triangulate::ViewRay;
 use glam::{DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 
 /// A growing model.
 #[derive(Clone)]
-pub(super) struct Working<'a> {
+pub(super) struct GrowingModel<'a> {
     pub photos: &'a [PhotoInfo],
     pub tracks: &'a Tracks,
     pub options: &'a MapOptions,
     /// `[groups]` cameras.
     pub cameras: Vec<DCamera>,
     /// `[groups]` their initial focal lengths, px, and the sources of these.
-    pub first_focals: Vec<f64>,
-    pub sources: Vec<Source>,
+    pub initial_focals: Vec<f64>,
+    pub sources: Vec<FocalSource>,
     /// `[groups]` whether the focal length is held fixed because no value is better than another.
     pub focal_held: Vec<bool>,
     /// Whether principal points are adjusted instead of tangential coefficients.
@@ -40,7 +40,7 @@ pub(super) struct Working<'a> {
     pub used: Vec<bool>,
 }
 
-impl<'a> Working<'a> {
+impl<'a> GrowingModel<'a> {
     /// A model without photographs.
     pub fn new(photos: &'a [PhotoInfo], cameras: &Cameras, tracks: &'a Tracks, options: &'a MapOptions) -> Self {
         let mut model = Self {
@@ -48,7 +48,7 @@ impl<'a> Working<'a> {
             tracks,
             options,
             cameras: cameras.iter().map(|c| c.0).collect(),
-            first_focals: cameras.iter().map(|c| c.0.focal()).collect(),
+            initial_focals: cameras.iter().map(|c| c.0.focal()).collect(),
             sources: cameras.iter().map(|c| c.1).collect(),
             focal_held: vec![false; cameras.len()],
             principal_free: false,
@@ -68,24 +68,24 @@ impl<'a> Working<'a> {
     }
 
     /// Sets the pose of a photograph, and of those on its rig.
-    pub fn place(&mut self, photo: usize, pose: DPose) {
+    pub fn set_pose(&mut self, photo: usize, pose: DPose) {
         for i in 0..self.rigs[photo].len() {
             let other = self.rigs[photo][i];
             self.poses[other] = Some(DPose {
-                rotation: pose.rotation * self.mount(photo).inverse() * self.mount(other),
+                rotation: pose.rotation * self.rig_from_camera(photo).inverse() * self.rig_from_camera(other),
                 ..pose
             });
         }
     }
 
-    /// Sets the pose of the rig of the photograph `leader`.
-    pub fn place_rig(&mut self, leader: usize, pose: DPose) {
-        let rotation = pose.rotation * self.mount(leader);
-        self.place(leader, DPose { rotation, ..pose });
+    /// Sets the pose of the rig of the photograph `reference`.
+    pub fn set_rig_pose(&mut self, reference: usize, pose: DPose) {
+        let rotation = pose.rotation * self.rig_from_camera(reference);
+        self.set_pose(reference, DPose { rotation, ..pose });
     }
 
     /// The rotation of a photograph's axes into those of its rig.
-    pub fn mount(&self, photo: usize) -> DQuat {
+    pub fn rig_from_camera(&self, photo: usize) -> DQuat {
         self.photos[photo].mount.map_or(DQuat::IDENTITY, |mount| mount.rotation)
     }
 
@@ -98,10 +98,10 @@ impl<'a> Working<'a> {
     }
 
     /// Adopts known poses and cameras, which are held fixed, and triangulates the points that they see.
-    pub fn hold(&mut self, known: &Known) {
+    pub fn hold(&mut self, known: &KnownGeometry) {
         self.held_poses = known.poses.iter().map(Option::is_some).collect();
         self.held_cameras = known.cameras.iter().map(Option::is_some).collect();
-        self.take_poses(&known.poses);
+        self.adopt_poses(&known.poses);
     }
 
     /// Adopts the poses and cameras of a finished model, to settle it once more.
@@ -111,7 +111,7 @@ impl<'a> Working<'a> {
         }
         self.focal_held.clone_from(&model.focal_held);
         self.undistort();
-        self.take_poses(&model.poses);
+        self.adopt_poses(&model.poses);
     }
 
     /// Makes later adjustments move principal points instead of tangential coefficients.
@@ -125,11 +125,11 @@ impl<'a> Working<'a> {
     }
 
     /// Adopts poses, and triangulates the points that their photographs see.
-    fn take_poses(&mut self, poses: &[Option<DPose>]) {
+    fn adopt_poses(&mut self, poses: &[Option<DPose>]) {
         self.poses = poses.to_vec();
         let all: Vec<usize> = (0..self.tracks.len()).collect();
         self.triangulate(&all);
-        let points = self.with_points();
+        let points = self.triangulated_tracks();
         self.filter(&points);
     }
 
@@ -153,13 +153,13 @@ impl<'a> Working<'a> {
         &self.cameras[self.photos[photo as usize].group]
     }
 
-    /// The sight of an observation; `None` if its photograph is not registered or its lens is not invertible there.
-    pub fn sight(&self, observation: usize) -> Option<Sight> {
+    /// The ray of an observation; `None` if its photograph is not registered or its lens is not invertible there.
+    pub fn view_ray(&self, observation: usize) -> Option<ViewRay> {
         let photo = self.tracks.observations[observation].photo;
         let pose = self.poses[photo as usize].as_ref()?;
         let at = self.plane[observation];
         at.is_finite()
-            .then(|| Sight::new(pose, at, self.camera(photo).focal_at(at)))
+            .then(|| ViewRay::new(pose, at, self.camera(photo).focal_at(at)))
     }
 
     /// The track of an observation.
@@ -173,7 +173,7 @@ impl<'a> Working<'a> {
     }
 
     /// Number of registered photographs of a camera.
-    pub fn registered_of(&self, group: usize) -> usize {
+    pub fn registered_in_group(&self, group: usize) -> usize {
         let posed = self.photos.iter().zip(&self.poses).filter(|(_, pose)| pose.is_some());
         posed.filter(|(photo, _)| photo.group == group).count()
     }
@@ -210,11 +210,11 @@ impl<'a> Working<'a> {
     /// Removes the poses of a photograph and of those on its rig, and the points that are then seen less than twice.
     pub fn deregister(&mut self, photo: usize) {
         for i in 0..self.rigs[photo].len() {
-            self.take_pose(self.rigs[photo][i]);
+            self.remove_pose(self.rigs[photo][i]);
         }
     }
 
-    fn take_pose(&mut self, photo: usize) {
+    fn remove_pose(&mut self, photo: usize) {
         self.poses[photo] = None;
         for i in 0..self.tracks.of_photo[photo].len() {
             let observation = self.tracks.of_photo[photo][i];
@@ -232,8 +232,8 @@ impl<'a> Working<'a> {
         for track in 0..self.tracks.len() {
             let Some(point) = self.points[track] else { continue };
             for o in self.tracks.range(track).filter(|o| self.used[*o]) {
-                if let Some(sight) = self.sight(o) {
-                    sum += sight.error_squared(point).sqrt();
+                if let Some(ray) = self.view_ray(o) {
+                    sum += ray.error_squared(point).sqrt();
                     count += 1;
                 }
             }

@@ -7,11 +7,11 @@ use crate::adjust::{AdjustedCamera, Freedom};
 use crate::geometry::camera::DCamera;
 
 /// Factors by which the focal length is multiplied.
-const OTHERS: [f64; 2] = [0.9, 1.1];
+const FOCAL_FACTORS: [f64; 2] = [0.9, 1.1];
 /// Minimum fraction by which the cost rises at each. 113 photographs around a bottle on a floor, whose pairs show a plane and whose focal
 /// length is within 2 % of COLMAP's: 0.18 and 0.16. Ten photographs of a fox's head, whose focal length is 25 % too long: -0.01 and
 /// 0.05.
-const WORSE: f64 = 0.01;
+const MIN_COST_INCREASE: f64 = 0.01;
 
 /// Whether `model` determines the focal length of the camera of `group`, rather than fitting any value equally well; poses, points and
 /// that camera's radial distortion adapt to each value.
@@ -34,6 +34,6 @@ pub fn determines_focal(photos: &[PhotoInfo], features: &[Features], model: &Mod
         let mut problem = readjust::problem(photos, features, model, cameras.collect(), |photo| photos[photo].group);
         problem.solve(&readjust::OPTIONS).final_cost
     };
-    let least = (1.0 + WORSE) * cost(1.0);
-    OTHERS.iter().all(|ratio| cost(*ratio) > least)
+    let min_cost = (1.0 + MIN_COST_INCREASE) * cost(1.0);
+    FOCAL_FACTORS.iter().all(|ratio| cost(*ratio) > min_cost)
 }

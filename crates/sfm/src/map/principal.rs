@@ -10,20 +10,20 @@
 //! Leaving them free from the start is worse where photographs were cropped around the centre.
 
 use super::finish;
-use super::model::Working;
+use super::model::GrowingModel;
 use super::readjust::{self, posed};
-use super::refine::{belief, finished};
+use super::refine::{camera_prior, final_freedom};
 use super::tracks::Tracks;
 use super::types::{MapOptions, Model, PhotoInfo, Progress, Reconstruction};
 use crate::Features;
 use crate::adjust::{AdjustedCamera, Focal, Freedom};
 
 /// Minimum fraction by which the cost falls with free principal points.
-const BETTER: f64 = 0.03;
+const MIN_COST_REDUCTION: f64 = 0.03;
 
 /// The first model of `found` with free principal points; `photos` have its groups. `None` if principal points at the centre fit well
 /// enough, or if photographs or observations would be lost.
-pub(super) fn freed(
+pub(super) fn with_free_principal_points(
     photos: &[PhotoInfo],
     features: &[Features],
     found: &Reconstruction,
@@ -31,20 +31,20 @@ pub(super) fn freed(
     progress: &mut dyn FnMut(Progress),
 ) -> Option<Model> {
     let model = found.models.first()?;
-    if gain(photos, features, model, options) < BETTER {
+    if cost_reduction(photos, features, model, options) < MIN_COST_REDUCTION {
         return None;
     }
     let tracks = Tracks::new(features, &found.pairs);
-    let mut working = Working::new(photos, &found.cameras, &tracks, options);
+    let mut working = GrowingModel::new(photos, &found.cameras, &tracks, options);
     working.resume(model);
     working.free_principal_points();
-    working.settle_fully(progress);
+    working.refine_fully(progress);
     let free = finish::finish(&working, photos);
     (free.registered() >= model.registered() && free.observations() >= model.observations()).then_some(free)
 }
 
 /// The fraction by which the cost of `model` falls with free principal points.
-fn gain(photos: &[PhotoInfo], features: &[Features], model: &Model, options: &MapOptions) -> f64 {
+fn cost_reduction(photos: &[PhotoInfo], features: &[Features], model: &Model, options: &MapOptions) -> f64 {
     let groups = model.cameras.len();
     let (mut count, mut known) = (vec![0; groups], vec![false; groups]);
     for photo in posed(model).map(|photo| &photos[photo]) {
@@ -58,12 +58,12 @@ fn gain(photos: &[PhotoInfo], features: &[Features], model: &Model, options: &Ma
         number[group] = cameras.len();
         let freedom = match known[group] {
             true => Freedom::HELD,
-            false => finished(camera, count[group], model.focal_held[group], options),
+            false => final_freedom(camera, count[group], model.focal_held[group], options),
         };
         cameras.push(AdjustedCamera {
             camera: *camera,
             freedom,
-            belief: belief(camera, camera.focal(), 0.5),
+            prior: camera_prior(camera, camera.focal(), 0.5),
         });
     }
     if cameras.iter().all(|camera| camera.freedom.focal == Focal::Held) {
@@ -78,6 +78,10 @@ fn gain(photos: &[PhotoInfo], features: &[Features], model: &Model, options: &Ma
         }
     }
     let free = problem.solve(&readjust::OPTIONS);
-    let gain = 1.0 - free.final_cost / held.final_cost;
-    if gain.is_finite() { gain } else { 0.0 }
+    let cost_reduction = 1.0 - free.final_cost / held.final_cost;
+    if cost_reduction.is_finite() {
+        cost_reduction
+    } else {
+        0.0
+    }
 }

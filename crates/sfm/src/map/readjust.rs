@@ -5,7 +5,7 @@ use crate::Features;
 use crate::adjust::{AdjustOptions, AdjustedCamera, Loss, Observation, Problem, View};
 
 /// Number of observations of each photograph, from long tracks, that are adjusted.
-const ENOUGH: usize = 200;
+const MIN_PHOTO_OBSERVATIONS: usize = 200;
 
 /// The photographs of `model` with a pose.
 pub(super) fn posed(model: &Model) -> impl Iterator<Item = usize> {
@@ -32,7 +32,7 @@ pub(super) fn problem(
         problem.poses.push(model.poses[photo].expect("posed"));
         problem.held_poses.push(false);
     }
-    for point in covering(model, photos.len()) {
+    for point in covering_points(model, photos.len()) {
         let point = &model.points[point];
         for (photo, keypoint) in &point.track {
             problem.observations.push(Observation {
@@ -54,18 +54,20 @@ pub(super) const OPTIONS: AdjustOptions = AdjustOptions {
     tolerance: 3e-4,
 };
 
-/// Indices of points, those with long tracks first, that give each photograph at least [`ENOUGH`] observations where possible.
-fn covering(model: &Model, photos: usize) -> Vec<usize> {
+/// Indices of points, those with long tracks first, that give each photograph at least [`MIN_PHOTO_OBSERVATIONS`] where possible.
+fn covering_points(model: &Model, photos: usize) -> Vec<usize> {
     let mut order: Vec<usize> = (0..model.points.len()).collect();
     order.sort_by_key(|i| std::cmp::Reverse(model.points[*i].track.len()));
-    let mut seen = vec![0usize; photos];
+    let mut counts = vec![0usize; photos];
     order.retain(|i| {
         let track = &model.points[*i].track;
-        let needed = track.iter().any(|(photo, _)| seen[*photo as usize] < ENOUGH);
-        if needed {
-            track.iter().for_each(|(photo, _)| seen[*photo as usize] += 1);
+        let is_needed = track
+            .iter()
+            .any(|(photo, _)| counts[*photo as usize] < MIN_PHOTO_OBSERVATIONS);
+        if is_needed {
+            track.iter().for_each(|(photo, _)| counts[*photo as usize] += 1);
         }
-        needed
+        is_needed
     });
     order
 }

@@ -1,10 +1,10 @@
 //! Bundle adjustment of a growing model.
 
-use super::focal::{Source, are_far};
-use super::model::Working;
+use super::focal::{FocalSource, are_far_apart};
+use super::model::GrowingModel;
 use super::types::MapOptions;
 use crate::adjust::{
-    AdjustOptions, AdjustReport, AdjustedCamera, Belief, Focal, Freedom, Loss, Observation, Problem, View,
+    AdjustOptions, AdjustReport, AdjustedCamera, Focal, Freedom, Loss, Observation, Prior, Problem, View,
 };
 use crate::geometry::camera::DCamera;
 use crate::geometry::pose::DPose;
@@ -12,16 +12,16 @@ use glam::DVec2;
 
 /// The loss while the model grows and poses may be far off, and the final one, which gives wrong matches less weight.
 const GROWING_LOSS: Loss = Loss::SoftL1(1.0);
-const LOSS: Loss = Loss::Cauchy(1.0);
+const FINAL_LOSS: Loss = Loss::Cauchy(1.0);
 /// Number of observations of a photograph, from long tracks, that are enough for an adjustment while the model grows.
-const ENOUGH: usize = 300;
+const MIN_PHOTO_OBSERVATIONS: usize = 300;
 
 /// Minimum number of registered photographs to adjust the focal length of every camera, even of one with a single photograph.
-const ANCHORED: usize = 5;
+const MIN_ANCHORED_PHOTOS: usize = 5;
 
 /// Cost of one standard deviation of an intrinsic parameter, as a squared error, px^2: that of ten observations that are off by one
 /// pixel.
-const BELIEF: f64 = 10.0;
+const PRIOR_COST: f64 = 10.0;
 
 /// Which parts of the model an adjustment changes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -31,36 +31,36 @@ pub(super) enum Extent {
     /// All points, the full lens, and the principal point where that is free.
     Full,
     /// Like `Full`, until convergence.
-    Last,
+    Final,
 }
 
-impl Working<'_> {
+impl GrowingModel<'_> {
     /// Adjusts everything.
     pub fn adjust_all(&mut self, extent: Extent) -> AdjustReport {
-        let points = self.with_points();
+        let points = self.triangulated_tracks();
         let chosen = if extent == Extent::Growing {
-            self.covering(&points, ENOUGH)
+            self.covering_tracks(&points, MIN_PHOTO_OBSERVATIONS)
         } else {
             points.clone()
         };
         let mut problem = Problem::default();
         let mut view_of = vec![None; self.poses.len()];
-        let leaders: Vec<usize> = self.leaders().collect();
-        for leader in &leaders {
-            self.add_views(&mut problem, *leader, self.held_poses[*leader], &mut view_of);
+        let reference_photos: Vec<usize> = self.reference_photos().collect();
+        for reference in &reference_photos {
+            self.add_views(&mut problem, *reference, self.held_poses[*reference], &mut view_of);
         }
         for group in 0..self.cameras.len() {
             problem.cameras.push(AdjustedCamera {
                 camera: self.cameras[group],
                 freedom: self.freedom(group, extent),
-                belief: self.belief(group),
+                prior: self.prior(group),
             });
         }
         self.add_points(&mut problem, &chosen, |_| false, &view_of);
         let (loss, iterations, tolerance) = match extent {
             Extent::Growing => (GROWING_LOSS, 8, 1e-3),
-            Extent::Full => (LOSS, 15, 1e-4),
-            Extent::Last => (LOSS, 30, 1e-5),
+            Extent::Full => (FINAL_LOSS, 15, 1e-4),
+            Extent::Final => (FINAL_LOSS, 30, 1e-5),
         };
         let options = AdjustOptions {
             loss,
@@ -68,18 +68,18 @@ impl Working<'_> {
             tolerance,
         };
         let report = problem.solve(&options);
-        for (leader, pose) in leaders.into_iter().zip(&problem.poses) {
-            self.place_rig(leader, *pose);
+        for (reference, pose) in reference_photos.into_iter().zip(&problem.poses) {
+            self.set_rig_pose(reference, *pose);
         }
         for group in 0..self.cameras.len() {
-            self.take_camera(group, problem.cameras[group].camera);
+            self.adopt_camera(group, problem.cameras[group].camera);
         }
         for (track, point) in chosen.iter().zip(&problem.points) {
             self.points[*track] = Some(*point);
         }
         self.undistort();
         if chosen.len() < points.len() {
-            self.polish(&points);
+            self.refine_points(&points);
         }
         report
     }
@@ -93,13 +93,13 @@ impl Working<'_> {
             variable[track] |= self.used[*o as usize] && self.points[track].is_some();
         }
         // Fixed points of neighbours anchor them.
-        let mut listed = vec![false; self.tracks.len()];
+        let mut is_listed = vec![false; self.tracks.len()];
         let mut tracks = Vec::new();
         for neighbour in &local {
             for o in self.rigs[*neighbour].iter().flat_map(|p| &self.tracks.of_photo[*p]) {
                 let track = self.track_of(*o);
-                if self.used[*o as usize] && !listed[track] {
-                    listed[track] = true;
+                if self.used[*o as usize] && !is_listed[track] {
+                    is_listed[track] = true;
                     tracks.push(track);
                 }
             }
@@ -110,7 +110,7 @@ impl Working<'_> {
         for neighbour in &local {
             self.add_views(&mut problem, *neighbour, self.held_poses[*neighbour], &mut view_of);
         }
-        for other in self.leaders().filter(|leader| !local.contains(leader)) {
+        for other in self.reference_photos().filter(|reference| !local.contains(reference)) {
             self.add_views(&mut problem, other, true, &mut view_of);
         }
         problem.cameras = self
@@ -120,7 +120,7 @@ impl Working<'_> {
             .collect();
         let group = self.photos[photo].group;
         // The camera is adjusted only if it has no other photograph that this could harm.
-        let freedom = if self.registered_of(group) == 1 {
+        let freedom = if self.registered_in_group(group) == 1 {
             self.freedom(group, Extent::Growing)
         } else {
             Freedom::HELD
@@ -128,7 +128,7 @@ impl Working<'_> {
         if freedom != Freedom::HELD {
             problem.cameras[group] = AdjustedCamera {
                 freedom,
-                belief: self.belief(group),
+                prior: self.prior(group),
                 ..problem.cameras[group]
             };
         }
@@ -138,31 +138,31 @@ impl Working<'_> {
             iterations: 6,
             tolerance: 1e-3,
         });
-        for (leader, pose) in local.into_iter().zip(&problem.poses) {
-            self.place_rig(leader, *pose);
+        for (reference, pose) in local.into_iter().zip(&problem.poses) {
+            self.set_rig_pose(reference, *pose);
         }
         for (track, point) in tracks.iter().zip(&problem.points) {
             self.points[*track] = Some(*point);
         }
         if freedom != Freedom::HELD {
-            self.take_camera(group, problem.cameras[group].camera);
+            self.adopt_camera(group, problem.cameras[group].camera);
             self.undistort();
         }
         self.filter(&tracks);
     }
 
     /// Whether there are several cameras whose focal lengths are guesses.
-    pub(super) fn has_open_focals(&self) -> bool {
-        let open = |group: &usize| self.sources[*group] == Source::Guess && !self.held_cameras[*group];
-        (0..self.sources.len()).filter(open).count() > 1
+    pub(super) fn has_guessed_focals(&self) -> bool {
+        let is_guess = |group: &usize| self.sources[*group] == FocalSource::Guess && !self.held_cameras[*group];
+        (0..self.sources.len()).filter(is_guess).count() > 1
     }
 
     /// Whether the focal length of a camera is far from where it began.
-    pub(super) fn is_far_from_first_focals(&self) -> bool {
-        let far = |group: &usize| are_far(self.cameras[*group].focal(), self.first_focals[*group]);
+    pub(super) fn is_far_from_initial_focals(&self) -> bool {
+        let is_far = |group: &usize| are_far_apart(self.cameras[*group].focal(), self.initial_focals[*group]);
         (0..self.cameras.len())
-            .filter(far)
-            .any(|group| self.registered_of(group) > 0)
+            .filter(is_far)
+            .any(|group| self.registered_in_group(group) > 0)
     }
 
     /// Multiplies the focal length of a group by `factor`.
@@ -173,43 +173,43 @@ impl Working<'_> {
         self.undistort();
     }
 
-    /// The first photograph of each registered rig; a photograph without a rig is its own leader.
-    fn leaders(&self) -> impl Iterator<Item = usize> {
+    /// The first photograph of each registered rig; a photograph without a rig is its own.
+    fn reference_photos(&self) -> impl Iterator<Item = usize> {
         (0..self.poses.len()).filter(|p| self.poses[*p].is_some() && self.rigs[*p][0] == *p)
     }
 
-    /// Adds the pose of the rig of `leader` and a view for each of its photographs, whose index is stored in `view_of`.
-    fn add_views(&self, problem: &mut Problem, leader: usize, held: bool, view_of: &mut [Option<u32>]) {
-        let Some(pose) = self.poses[leader] else { return };
+    /// Adds the pose of the rig of `reference` and a view for each of its photographs, whose index is stored in `view_of`.
+    fn add_views(&self, problem: &mut Problem, reference: usize, held: bool, view_of: &mut [Option<u32>]) {
+        let Some(pose) = self.poses[reference] else { return };
         let number = problem.poses.len() as u32;
         problem.poses.push(DPose {
-            rotation: pose.rotation * self.mount(leader).inverse(),
+            rotation: pose.rotation * self.rig_from_camera(reference).inverse(),
             ..pose
         });
         problem.held_poses.push(held);
-        for photo in &self.rigs[leader] {
+        for photo in &self.rigs[reference] {
             view_of[*photo] = Some(problem.views.len() as u32);
             problem.views.push(View {
                 pose: number,
                 camera: self.photos[*photo].group as u32,
-                mount: self.mount(*photo),
+                rig_from_camera: self.rig_from_camera(*photo),
             });
         }
     }
 
-    /// The leaders of the rig of `photo` and of the rigs that share most points with it, at most
+    /// The reference photographs of the rig of `photo` and of the rigs that share most points with it, at most
     /// [`MapOptions::local_photos`](super::MapOptions) in total.
     fn neighbours(&self, photo: usize) -> Vec<usize> {
-        let leader = |photo: usize| self.rigs[photo][0];
+        let reference = |photo: usize| self.rigs[photo][0];
         let mut shared = vec![0usize; self.poses.len()];
         for o in self.rigs[photo].iter().flat_map(|p| &self.tracks.of_photo[*p]) {
             if self.used[*o as usize] {
                 for other in self.tracks.range(self.track_of(*o)).filter(|o| self.used[*o]) {
-                    shared[leader(self.tracks.observations[other].photo as usize)] += 1;
+                    shared[reference(self.tracks.observations[other].photo as usize)] += 1;
                 }
             }
         }
-        shared[leader(photo)] = usize::MAX;
+        shared[reference(photo)] = usize::MAX;
         let mut order: Vec<usize> = (0..shared.len())
             .filter(|p| shared[*p] > 0 && self.poses[*p].is_some())
             .collect();
@@ -249,20 +249,20 @@ impl Working<'_> {
         }
     }
 
-    /// A subset of `tracks`, long ones preferred, that gives each photograph at least `enough` observations where possible; ascending.
-    fn covering(&self, tracks: &[usize], enough: usize) -> Vec<usize> {
+    /// A subset of `tracks`, long ones preferred, that gives each photograph at least `min_observations` where possible; ascending.
+    fn covering_tracks(&self, tracks: &[usize], min_observations: usize) -> Vec<usize> {
         let length = |track: usize| self.tracks.range(track).filter(|o| self.used[*o]).count();
         let mut order: Vec<(usize, usize)> = tracks.iter().map(|t| (length(*t), *t)).collect();
         order.sort_by_key(|(length, track)| (std::cmp::Reverse(*length), *track));
-        let mut seen = vec![0usize; self.poses.len()];
+        let mut counts = vec![0usize; self.poses.len()];
         let mut chosen = Vec::new();
         for (_, track) in order {
             let photos = || {
                 let observations = self.tracks.range(track).filter(|o| self.used[*o]);
                 observations.map(|o| self.tracks.observations[o].photo as usize)
             };
-            if photos().any(|p| seen[p] < enough) {
-                photos().for_each(|p| seen[p] += 1);
+            if photos().any(|p| counts[p] < min_observations) {
+                photos().for_each(|p| counts[p] += 1);
                 chosen.push(track);
             }
         }
@@ -275,15 +275,15 @@ impl Working<'_> {
         if self.held_cameras[group] {
             return Freedom::HELD;
         }
-        let count = self.registered_of(group);
+        let count = self.registered_in_group(group);
         let full = extent != Extent::Growing && count >= self.options.full_lens_photos;
         // Other photographs anchor the points of a camera with few photographs.
-        let least = match self.sources[group] {
-            _ if self.registered() >= ANCHORED => 1,
-            Source::Prior => 4,
-            Source::Pairs | Source::Guess => 3,
+        let min_photos = match self.sources[group] {
+            _ if self.registered() >= MIN_ANCHORED_PHOTOS => 1,
+            FocalSource::Prior => 4,
+            FocalSource::Pairs | FocalSource::Guess => 3,
         };
-        let focal_held = self.focal_held[group] || count < least;
+        let focal_held = self.focal_held[group] || count < min_photos;
         let lens = lens_freedom(&self.cameras[group], count, focal_held, full);
         match self.principal_free && extent != Extent::Growing && !focal_held {
             true => lens.with_principal(),
@@ -292,18 +292,18 @@ impl Working<'_> {
     }
 
     /// The prior on a group's camera.
-    fn belief(&self, group: usize) -> Belief {
+    fn prior(&self, group: usize) -> Prior {
         // If the focal lengths of several cameras are guesses, each may differ much from the guess.
-        let focal = if self.has_open_focals() && self.sources[group] == Source::Guess {
+        let focal = if self.has_guessed_focals() && self.sources[group] == FocalSource::Guess {
             1.0
         } else {
             0.5
         };
-        belief(&self.cameras[group], self.first_focals[group], focal)
+        camera_prior(&self.cameras[group], self.initial_focals[group], focal)
     }
 
     /// Adopts an adjusted camera if its values are plausible; otherwise its focal length is held fixed from now on.
-    fn take_camera(&mut self, group: usize, camera: DCamera) {
+    fn adopt_camera(&mut self, group: usize, camera: DCamera) {
         let focal = camera.focal() / camera.long_side();
         let lens = camera.parameters[4..].iter().all(|k| k.abs() < 1.0);
         if (0.2..10.0).contains(&focal) && lens {
@@ -315,7 +315,7 @@ impl Working<'_> {
 }
 
 /// Which intrinsics of a finished model's camera are adjusted, depending on the number of its photographs: all but the principal point.
-pub(super) fn finished(camera: &DCamera, count: usize, focal_held: bool, options: &MapOptions) -> Freedom {
+pub(super) fn final_freedom(camera: &DCamera, count: usize, focal_held: bool, options: &MapOptions) -> Freedom {
     lens_freedom(camera, count, focal_held, count >= options.full_lens_photos)
 }
 
@@ -341,10 +341,10 @@ fn lens_freedom(camera: &DCamera, count: usize, focal_held: bool, full: bool) ->
 /// A prior for cameras in general, which keeps parameters that the photographs do not determine at their usual values: square pixels, a
 /// weak lens, a focal length within the fraction `focal` of the initial one, and a principal point within a tenth of the long side from
 /// the centre, as in cropped photographs; it is free only where these require it.
-pub(super) fn belief(camera: &DCamera, first_focal: f64, focal: f64) -> Belief {
+pub(super) fn camera_prior(camera: &DCamera, initial_focal: f64, focal: f64) -> Prior {
     let long_side = camera.long_side();
     let deviations = [
-        focal * first_focal,
+        focal * initial_focal,
         0.002,
         0.1 * long_side,
         0.1 * long_side,
@@ -354,8 +354,8 @@ pub(super) fn belief(camera: &DCamera, first_focal: f64, focal: f64) -> Belief {
         0.002,
     ];
     let center = 0.5 * DVec2::new(f64::from(camera.width), f64::from(camera.height));
-    Belief {
-        values: [first_focal, 1.0, center.x, center.y, 0.0, 0.0, 0.0, 0.0],
-        weights: deviations.map(|d| BELIEF / (d * d)),
+    Prior {
+        values: [initial_focal, 1.0, center.x, center.y, 0.0, 0.0, 0.0, 0.0],
+        weights: deviations.map(|d| PRIOR_COST / (d * d)),
     }
 }

@@ -5,7 +5,7 @@ use crate::Features;
 use glam::DVec2;
 
 /// A photograph with at least this many tracks over three or more photographs needs no tracks over two.
-const ENOUGH: usize = 200;
+const MIN_LONG_TRACKS: usize = 200;
 
 /// A keypoint of a track.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -37,21 +37,25 @@ impl Tracks {
     ///
     /// Tracks over two photographs contribute least and are wrong most often, so only photographs with few other tracks have them.
     pub fn new(features: &[Features], pairs: &[VerifiedPair]) -> Self {
-        let mut tracks = joined(features, pairs);
-        let mut longer = vec![0usize; features.len()];
+        let mut tracks = join_matches(features, pairs);
+        let mut long_tracks = vec![0usize; features.len()];
         for member in tracks.iter().filter(|m| m.len() > 2).flatten() {
-            longer[member.photo as usize] += 1;
+            long_tracks[member.photo as usize] += 1;
         }
-        tracks.retain(|m| m.len() > 2 || m.iter().any(|member| longer[member.photo as usize] < ENOUGH));
-        Self::of(features, tracks)
+        tracks.retain(|m| {
+            m.len() > 2
+                || m.iter()
+                    .any(|member| long_tracks[member.photo as usize] < MIN_LONG_TRACKS)
+        });
+        Self::from_members(features, tracks)
     }
 
     /// Like [`Self::new`], with all tracks over two photographs.
     pub fn complete(features: &[Features], pairs: &[VerifiedPair]) -> Self {
-        Self::of(features, joined(features, pairs))
+        Self::from_members(features, join_matches(features, pairs))
     }
 
-    fn of(features: &[Features], members: Vec<Vec<Observation>>) -> Self {
+    fn from_members(features: &[Features], members: Vec<Vec<Observation>>) -> Self {
         let mut tracks = Self {
             starts: vec![0],
             of_photo: vec![Vec::new(); features.len()],
@@ -82,7 +86,7 @@ impl Tracks {
 }
 
 /// The observations of each track, sorted by photograph; tracks are in the order of their first observation.
-fn joined(features: &[Features], pairs: &[VerifiedPair]) -> Vec<Vec<Observation>> {
+fn join_matches(features: &[Features], pairs: &[VerifiedPair]) -> Vec<Vec<Observation>> {
     // Keypoints at the same position (a blob with two orientations) are one node.
     let mut first_node = vec![0u32];
     let mut node_of: Vec<Vec<u32>> = Vec::new();
@@ -104,7 +108,7 @@ fn joined(features: &[Features], pairs: &[VerifiedPair]) -> Vec<Vec<Observation>
         node_of.push(canonical.into_iter().map(|c| base + c).collect());
     }
     let nodes = *first_node.last().expect("starts with zero") as usize;
-    let mut sets = Sets::new(nodes);
+    let mut sets = DisjointSets::new(nodes);
     let mut order: Vec<usize> = (0..pairs.len()).collect();
     // Rotation-only pairs come last: their wrong matches are the hardest to notice.
     order.sort_by_key(|i| {
@@ -147,13 +151,13 @@ fn joined(features: &[Features], pairs: &[VerifiedPair]) -> Vec<Vec<Observation>
 }
 
 /// Disjoint sets of nodes with the photographs of each set.
-struct Sets {
+struct DisjointSets {
     parent: Vec<u32>,
     /// Per root: photographs, ascending; empty for a single node.
     photos: Vec<Vec<u32>>,
 }
 
-impl Sets {
+impl DisjointSets {
     fn new(nodes: usize) -> Self {
         Self {
             parent: (0..nodes as u32).collect(),

@@ -11,57 +11,58 @@ use rayon::prelude::*;
 use std::f64::consts::PI;
 
 /// Minimum number of photographs in a ring, which is at one height, and minimum fraction of all photographs that are in rings.
-const LEAST: usize = 6;
-const PART: f64 = 0.5;
+const MIN_RING_PHOTOS: usize = 6;
+const MIN_RING_FRACTION: f64 = 0.5;
 /// Angles of rotation between two photographs that determine an axis, radians.
-const TURN: std::ops::Range<f64> = 8.0 * PI / 180.0..170.0 * PI / 180.0;
+const ROTATION_RANGE_RADIANS: std::ops::Range<f64> = 8.0 * PI / 180.0..170.0 * PI / 180.0;
 /// How much the axes of one ring may differ: cosine of the maximum angle between them, and their maximum distance relative to the
 /// distance from the camera; and the maximum shift along an axis, also relative to that distance.
-const DIRECTION: f64 = 0.99985;
-const PLACE: f64 = 0.02;
-const SHIFT: f64 = 0.01;
+const MIN_AXIS_COSINE: f64 = 0.99985;
+const MAX_AXIS_DISTANCE: f64 = 0.02;
+const MAX_AXIS_SHIFT: f64 = 0.01;
 /// Maximum number of photographs from which rings are searched: each ring has many.
-const ANCHORS: usize = 64;
+const MAX_ANCHORS: usize = 64;
 
 /// The axis about which the scene turns, in camera axes.
 struct Axis {
     direction: DVec3,
     /// Its point nearest to the camera.
-    place: DVec3,
+    point: DVec3,
 }
 
 impl Axis {
     /// The axis about which the scene turns between the cameras at `b` and `a`, in the axes of `a`, if it turns enough and does not shift
     /// along the axis.
     fn between(a: &DPose, b: &DPose) -> Option<Self> {
-        let turn = (a.rotation.inverse() * b.rotation).normalize();
-        let turn = if turn.w < 0.0 { -turn } else { turn };
-        let (direction, angle) = turn.to_axis_angle();
+        let rotation = (a.rotation.inverse() * b.rotation).normalize();
+        let rotation = if rotation.w < 0.0 { -rotation } else { rotation };
+        let (direction, angle) = rotation.to_axis_angle();
         let shift = a.camera_from_world(b.position);
         let along = direction.dot(shift);
         let across = shift - along * direction;
-        let place = 0.5 * (across + direction.cross(across) / (0.5 * angle).tan());
-        (TURN.contains(&angle) && along.abs() < SHIFT * place.length()).then_some(Self { direction, place })
+        let point = 0.5 * (across + direction.cross(across) / (0.5 * angle).tan());
+        (ROTATION_RANGE_RADIANS.contains(&angle) && along.abs() < MAX_AXIS_SHIFT * point.length())
+            .then_some(Self { direction, point })
     }
 
     fn is_near(&self, other: &Self) -> bool {
-        self.direction.dot(other.direction).abs() > DIRECTION
-            && self.place.distance(other.place) < PLACE * self.place.length()
+        self.direction.dot(other.direction).abs() > MIN_AXIS_COSINE
+            && self.point.distance(other.point) < MAX_AXIS_DISTANCE * self.point.length()
     }
 }
 
 /// The photographs of each ring, largest first, if the model is that of a turntable; otherwise empty.
-pub fn turntable(model: &Model) -> Vec<Vec<usize>> {
+pub fn turntable_rings(model: &Model) -> Vec<Vec<usize>> {
     let posed = model.poses.iter().enumerate().filter(|(_, pose)| pose.is_some());
-    let mut left: Vec<usize> = posed.map(|(photo, _)| photo).collect();
-    let all = left.len();
+    let mut remaining: Vec<usize> = posed.map(|(photo, _)| photo).collect();
+    let all = remaining.len();
     let mut rings = Vec::new();
-    while let Some(ring) = largest_ring(model, &left) {
-        left.retain(|photo| !ring.contains(photo));
+    while let Some(ring) = largest_ring(model, &remaining) {
+        remaining.retain(|photo| !ring.contains(photo));
         rings.push(ring);
     }
-    let held: usize = rings.iter().map(Vec::len).sum();
-    if held as f64 >= PART * all as f64 {
+    let in_rings: usize = rings.iter().map(Vec::len).sum();
+    if in_rings as f64 >= MIN_RING_FRACTION * all as f64 {
         rings
     } else {
         Vec::new()
@@ -80,12 +81,12 @@ fn largest_ring(model: &Model, of: &[usize]) -> Option<Vec<usize>> {
     };
     let rings: Vec<Vec<usize>> = of
         .par_iter()
-        .step_by(of.len().div_ceil(ANCHORS).max(1))
+        .step_by(of.len().div_ceil(MAX_ANCHORS).max(1))
         .map(|anchor| around(*anchor))
         .collect();
     // The first of several rings of equal size.
     let ring = rings.into_iter().rev().max_by_key(Vec::len)?;
-    (ring.len() >= LEAST).then_some(ring)
+    (ring.len() >= MIN_RING_PHOTOS).then_some(ring)
 }
 
 /// The photographs of those `axes` that are near `axis`.
@@ -135,12 +136,12 @@ mod tests {
         };
         let axis = Axis::between(&a, &b).expect("turned");
         assert!(axis.direction.dot(direction).abs() > 1.0 - 1e-12);
-        assert!(axis.place.distance(place) < 1e-9, "{}", axis.place);
+        assert!(axis.point.distance(place) < 1e-9, "{}", axis.point);
     }
 
     #[test]
     fn each_height_is_a_ring() {
-        let mut found = turntable(&rings(0.0));
+        let mut found = turntable_rings(&rings(0.0));
         found.iter_mut().for_each(|ring| ring.sort_unstable());
         found.sort_unstable();
         // The photograph on the opposite side is turned too far to determine an axis.
@@ -153,6 +154,6 @@ mod tests {
 
     #[test]
     fn hands_hold_no_axis() {
-        assert_eq!(turntable(&rings(0.03)), Vec::<Vec<usize>>::new());
+        assert_eq!(turntable_rings(&rings(0.03)), Vec::<Vec<usize>>::new());
     }
 }

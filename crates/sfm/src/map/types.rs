@@ -1,6 +1,6 @@
-use super::absent::ABSENT_PAIRS;
-use super::agree::{agreement, contradictions, strengths};
-use super::focal::Source;
+use super::agreement::{agreement, contradictions, strengths};
+use super::focal::FocalSource;
+use super::missing::MIN_MISSING_PAIRS;
 use crate::geometry::camera::DCamera;
 use crate::geometry::essential::Motion;
 use crate::geometry::pose::DPose;
@@ -31,12 +31,12 @@ pub struct PhotoInfo {
     /// The camera of its group, if it is known exactly; it is then held fixed.
     pub camera: Option<DCamera>,
     /// Its mount on a rig, if it is on one.
-    pub mount: Option<Mount>,
+    pub mount: Option<RigMount>,
 }
 
 /// How a photograph is mounted on a rig: all photographs of a rig are taken from one position.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Mount {
+pub struct RigMount {
     /// The rig's number.
     pub rig: usize,
     /// Rotation of the camera's axes into the rig's.
@@ -60,14 +60,14 @@ pub(crate) fn rigs(photos: &[PhotoInfo]) -> Vec<Vec<usize>> {
 
 /// Poses and cameras that are known before mapping and stay as they are.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Known {
+pub struct KnownGeometry {
     /// `[photos]` poses.
     pub poses: Vec<Option<DPose>>,
     /// `[groups]` cameras.
     pub cameras: Vec<Option<DCamera>>,
 }
 
-impl From<&Model> for Known {
+impl From<&Model> for KnownGeometry {
     fn from(model: &Model) -> Self {
         Self {
             poses: model.poses.clone(),
@@ -136,14 +136,14 @@ pub enum Progress {
         /// Number of pairs with a common geometry.
         pairs: usize,
         /// Number of pairs with matches.
-        of: usize,
+        total: usize,
     },
     /// A photograph has been registered.
     Registered {
         /// Photographs in this model.
         photos: usize,
         /// Total number of photographs.
-        of: usize,
+        total: usize,
         /// Points in this model.
         points: usize,
     },
@@ -194,16 +194,16 @@ pub struct Reconstruction {
     /// The pairs that were used.
     pub pairs: Vec<VerifiedPair>,
     /// `[groups]` the camera of each group before the last mapping, and where its focal length comes from.
-    pub cameras: Vec<(DCamera, Source)>,
+    pub cameras: Vec<(DCamera, FocalSource)>,
     /// Photographs of one group that turned out to have another focal length: each `Zoom` adds a group.
     pub zooms: Vec<Zoom>,
     /// Whether each photograph became its own group, because each has its own focal length and the metadata do not contain it.
     pub own_focals: bool,
     /// Pairs that share next to nothing, although their poses in the largest model, or in the model that was split, say that they see the
     /// same part of the scene; most expected points first.
-    pub absent: Vec<Absent>,
+    pub missing: Vec<MissingMatches>,
     /// Number of models of parts that were first mistaken for one another, if the model was split into them.
-    pub apart: Option<usize>,
+    pub split_models: Option<usize>,
 }
 
 impl Reconstruction {
@@ -224,12 +224,12 @@ impl Reconstruction {
 
     /// Pairs of photographs that should share points and do not, without those in `matched`; empty if there are too few to rule out
     /// coincidence.
-    pub fn absent_and_unmatched(&self, matched: &[PairMatches]) -> Vec<[u32; 2]> {
-        if self.absent.len() < ABSENT_PAIRS {
+    pub fn missing_and_unmatched(&self, matched: &[PairMatches]) -> Vec<[u32; 2]> {
+        if self.missing.len() < MIN_MISSING_PAIRS {
             return Vec::new();
         }
         let matched: BTreeSet<[u32; 2]> = matched.iter().map(|pair| pair.photos).collect();
-        let pairs = self.absent.iter().map(|pair| pair.photos);
+        let pairs = self.missing.iter().map(|pair| pair.photos);
         pairs.filter(|pair| !matched.contains(pair)).collect()
     }
 
@@ -247,7 +247,7 @@ impl Reconstruction {
 
 /// Two photographs that share next to nothing, although their poses in a model say that they see the same part of the scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Absent {
+pub struct MissingMatches {
     /// Their indices, ascending.
     pub photos: [u32; 2],
     /// Number of points of the model that should be matched.
@@ -258,7 +258,7 @@ pub struct Absent {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Zoom {
     /// Their previous group.
-    pub of: usize,
+    pub previous_group: usize,
     /// Their new group.
     pub group: usize,
     /// Their indices, ascending.

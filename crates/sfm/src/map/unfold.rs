@@ -8,44 +8,44 @@
 //! For few photographs, the tree has few pairs across a fold, often a single one, and all pairs are close. All neighbours then count as
 //! evidence, and closer and closer pairs are tried.
 
-use super::agree::{CONTRADICTS, agreement, contradictions, near_in_tree, spanning_tree, strengths};
+use super::agreement::{MIN_CONSISTENT_FRACTION, agreement, contradictions, near_in_tree, spanning_tree, strengths};
 use super::types::{FEW_PHOTOS, Model, Progress, VerifiedPair};
-use super::{Grown, Input, grown};
+use super::{GrownModels, Input, grow_models};
 
 /// Parameters that differ between few photographs and many.
 struct Rules {
     /// Minimum number of pairs that contradict a model for it to count as folded.
-    folded: usize,
+    min_contradictions: usize,
     /// Minimum number of photographs in another model, relative to the first. If only a few photographs lack a pose, they get a second
     /// attempt.
-    keeps: f64,
+    min_registered_ratio: f64,
     /// Maximum number of steps along the tree between the photographs of a pair that is used first: one mapping for each.
     hops: &'static [usize],
 }
 
-const OF_FEW: Rules = Rules {
-    folded: 1,
-    keeps: 0.75,
+const SMALL_CAPTURE_RULES: Rules = Rules {
+    min_contradictions: 1,
+    min_registered_ratio: 0.75,
     hops: &[4, 3, 2, 1],
 };
-const OF_MANY: Rules = Rules {
-    folded: 2,
-    keeps: 0.9,
+const LARGE_CAPTURE_RULES: Rules = Rules {
+    min_contradictions: 2,
+    min_registered_ratio: 0.9,
     hops: &[4],
 };
 /// Minimum fraction of the matches of a pair that agree with the model of the tree for the pair to be used.
-const AGREES: f64 = 0.8;
+const MIN_AGREEMENT: f64 = 0.8;
 
 /// Models, and how well the pairs fit the largest.
-struct Judged {
-    grown: Grown,
+struct Candidate {
+    grown: GrownModels,
     /// `[pairs]` the fraction of the matches that agree.
     agreement: Vec<Option<f64>>,
     /// Number of pairs that count as evidence and contradict it.
-    folds: usize,
+    contradicting: usize,
 }
 
-impl Judged {
+impl Candidate {
     fn registered(&self) -> usize {
         self.grown.models.first().map_or(0, Model::registered)
     }
@@ -61,7 +61,7 @@ impl Judged {
 
 /// If `found` is folded, the models with the most support among those that at most half as many pairs contradict; `found` if it is not
 /// folded or there are none.
-pub(super) fn unfolded(input: &Input, found: Grown, progress: &mut dyn FnMut(Progress)) -> Grown {
+pub(super) fn unfold(input: &Input, found: GrownModels, progress: &mut dyn FnMut(Progress)) -> GrownModels {
     let Input {
         photos,
         features,
@@ -69,49 +69,50 @@ pub(super) fn unfolded(input: &Input, found: Grown, progress: &mut dyn FnMut(Pro
         ..
     } = *input;
     let few = photos.len() <= FEW_PHOTOS;
-    let rules = if few { OF_FEW } else { OF_MANY };
+    let rules = if few { SMALL_CAPTURE_RULES } else { LARGE_CAPTURE_RULES };
     let strengths = strengths(photos, features, pairs);
     let tree = spanning_tree(photos.len(), pairs, &strengths);
-    let judged = |grown: Grown| {
+    let evaluate = |grown: GrownModels| {
         let model = grown.models.first();
         let agreement = model.map_or(vec![None; pairs.len()], |model| {
             agreement(photos, features, pairs, model)
         });
-        let folds = match few {
+        let contradicting = match few {
             true => contradictions(pairs, &strengths, &agreement).len(),
             false => {
-                let contradicts = |i: &&usize| agreement[**i].is_some_and(|a| a < CONTRADICTS);
+                let contradicts = |i: &&usize| agreement[**i].is_some_and(|a| a < MIN_CONSISTENT_FRACTION);
                 tree.iter().filter(contradicts).count()
             }
         };
-        Judged {
+        Candidate {
             grown,
             agreement,
-            folds,
+            contradicting,
         }
     };
-    let found = judged(found);
-    if found.folds < rules.folded {
+    let found = evaluate(found);
+    if found.contradicting < rules.min_contradictions {
         return found.grown;
     }
     let mut grow_from = |keep: &[bool]| {
         let kept = pairs.iter().zip(keep).filter(|(_, keep)| **keep);
         let kept: Vec<VerifiedPair> = kept.map(|(pair, _)| pair.clone()).collect();
-        judged(grown(input, &kept, progress))
+        evaluate(grow_models(input, &kept, progress))
     };
-    let least = rules.keeps * found.registered() as f64;
-    let mut best: Option<Judged> = None;
+    let min_registered = rules.min_registered_ratio * found.registered() as f64;
+    let mut best: Option<Candidate> = None;
     for hops in rules.hops {
         let skeleton = grow_from(&near_in_tree(photos.len(), pairs, &tree, *hops));
         let agrees = skeleton
             .agreement
             .iter()
-            .map(|a| a.is_none_or(|fraction| fraction > AGREES));
-        let again = grow_from(&agrees.collect::<Vec<bool>>());
-        for other in [again, skeleton] {
-            let unfolds = other.registered() as f64 >= least && 2 * other.folds <= found.folds;
-            let better = |best: &Judged| other.support(&strengths) > best.support(&strengths);
-            if unfolds && best.as_ref().is_none_or(better) {
+            .map(|a| a.is_none_or(|fraction| fraction > MIN_AGREEMENT));
+        let extended = grow_from(&agrees.collect::<Vec<bool>>());
+        for other in [extended, skeleton] {
+            let is_acceptable =
+                other.registered() as f64 >= min_registered && 2 * other.contradicting <= found.contradicting;
+            let has_more_support = |best: &Candidate| other.support(&strengths) > best.support(&strengths);
+            if is_acceptable && best.as_ref().is_none_or(has_more_support) {
                 best = Some(other);
             }
         }

@@ -1,37 +1,37 @@
 //! Verification: which matches of a pair agree with one geometry, and the kind of this geometry.
 
-use super::focal::{self, Source};
+use super::focal::{self, FocalSource};
 use super::types::{MapOptions, PairKind, PhotoInfo, Progress, VerifiedPair};
 use crate::geometry::camera::DCamera;
 use crate::geometry::correspondences::{Correspondences, sampson_squared};
 use crate::geometry::essential::{Essential, Motion, closest_essential, cross_matrix, motion_in_front, refine_motion};
 use crate::geometry::fundamental::Fundamental;
-use crate::geometry::homography::{Homography, turned};
+use crate::geometry::homography::{Homography, count_rotation_inliers};
 use crate::geometry::ransac::{Estimate, Limits, estimate};
-use crate::matching::{MatchOptions, TwoView, match_guided};
+use crate::matching::{MatchOptions, TwoViewGeometry, match_guided};
 use crate::{Features, PairMatches, median};
 use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
 
 /// Maximum number of samples. With 40 % inliers, one of 100 samples of five points has inliers only.
-const SAMPLES: usize = 600;
+const MAX_SAMPLES: usize = 600;
 const CONFIDENCE: f64 = 0.9999;
 /// A homography or a rotation explains a pair if it has at least this fraction of the essential matrix's inliers.
-const EXPLAINS: f64 = 0.8;
+const MIN_EXPLAINED_FRACTION: f64 = 0.8;
 
 /// Maximum distance of guided matches from their epipolar line, relative to that of inliers. Anything near a line may match: with the
 /// full distance, models of weak pairs lose a third of their photographs.
-const OFF_LINE: f64 = 0.5;
+const GUIDED_DISTANCE_RATIO: f64 = 0.5;
 
 /// A pair whose median angle is below this is a rotation, radians: about three pixels for a long side of a thousand.
-const LEAST_ANGLE: f64 = 0.003;
+const MIN_PARALLAX_RADIANS: f64 = 0.003;
 
 /// `[groups]` the camera of each group before any adjustment, and where its focal length comes from; the principal point is at the centre.
-pub type Cameras = Vec<(DCamera, Source)>;
+pub type Cameras = Vec<(DCamera, FocalSource)>;
 
 /// A pair's fundamental matrix between pixels that are centred and divided by each photograph's long side.
 #[derive(Clone, Debug)]
-pub(super) struct Uncalibrated {
+pub(super) struct UncalibratedPair {
     /// Index into the pairs.
     pub pair: usize,
     pub matrix: DMat3,
@@ -56,27 +56,30 @@ pub(super) fn verify_with(
     photos: &[PhotoInfo],
     features: &[Features],
     pairs: &[PairMatches],
-    given: &[Option<(DCamera, Source)>],
+    given: &[Option<(DCamera, FocalSource)>],
     options: &MapOptions,
     progress: &mut dyn FnMut(Progress),
 ) -> (Cameras, Vec<VerifiedPair>) {
     // If all photographs have metadata, a few pairs suffice to check them.
     let known = photos.iter().all(|p| p.focal_prior_px.is_some());
-    let mut voters: Vec<usize> = (0..pairs.len()).collect();
-    voters.sort_by_key(|i| (std::cmp::Reverse(pairs[*i].matches.len()), *i));
-    let mut votes = vec![!known; pairs.len()];
-    voters.iter().take(focal::ENOUGH).for_each(|i| votes[*i] = true);
-    let uncalibrated: Vec<Option<Uncalibrated>> = pairs
+    let mut by_match_count: Vec<usize> = (0..pairs.len()).collect();
+    by_match_count.sort_by_key(|i| (std::cmp::Reverse(pairs[*i].matches.len()), *i));
+    let mut is_checked = vec![!known; pairs.len()];
+    by_match_count
+        .iter()
+        .take(focal::MAX_CHECKED_PAIRS)
+        .for_each(|i| is_checked[*i] = true);
+    let uncalibrated: Vec<Option<UncalibratedPair>> = pairs
         .par_iter()
         .enumerate()
         .map(|(i, pair)| {
-            if !votes[i] || pair.matches.len() < options.min_inliers {
+            if !is_checked[i] || pair.matches.len() < options.min_inliers {
                 return None;
             }
-            fundamental(i, photos, features, pair, options)
+            estimate_fundamental(i, photos, features, pair, options)
         })
         .collect();
-    let found: Vec<&Uncalibrated> = uncalibrated.iter().flatten().collect();
+    let found: Vec<&UncalibratedPair> = uncalibrated.iter().flatten().collect();
     let mut cameras = focal::cameras(photos, features, pairs, &found, options);
     for (camera, given) in cameras.iter_mut().zip(given) {
         *camera = given.unwrap_or(*camera);
@@ -89,12 +92,12 @@ pub(super) fn verify_with(
             if pair.matches.len() < options.min_inliers || (!known && uncalibrated.is_none()) {
                 return None;
             }
-            calibrated(photos, features, pair, uncalibrated.as_ref(), &cameras, options)
+            verify_calibrated(photos, features, pair, uncalibrated.as_ref(), &cameras, options)
         })
         .collect();
     progress(Progress::Verified {
         pairs: verified.len(),
-        of: pairs.len(),
+        total: pairs.len(),
     });
     (cameras, verified)
 }
@@ -113,26 +116,29 @@ fn long_side(photo: &PhotoInfo) -> f64 {
 
 /// Points of a pair, centred and divided by each photograph's long side.
 pub(crate) fn centered_points(photos: &[PhotoInfo], features: &[Features], pair: &PairMatches) -> Vec<[DVec2; 2]> {
-    let place = |side: usize, keypoint: u32| {
+    let centered = |side: usize, keypoint: u32| {
         let photo = &photos[pair.photos[side] as usize];
         let center = 0.5 * DVec2::new(f64::from(photo.width), f64::from(photo.height));
         (pixel(&features[pair.photos[side] as usize], keypoint) - center) / long_side(photo)
     };
-    pair.matches.iter().map(|[i, j]| [place(0, *i), place(1, *j)]).collect()
+    pair.matches
+        .iter()
+        .map(|[i, j]| [centered(0, *i), centered(1, *j)])
+        .collect()
 }
 
-fn fundamental(
+fn estimate_fundamental(
     index: usize,
     photos: &[PhotoInfo],
     features: &[Features],
     pair: &PairMatches,
     options: &MapOptions,
-) -> Option<Uncalibrated> {
+) -> Option<UncalibratedPair> {
     let points = Correspondences::new(centered_points(photos, features, pair));
     let [a, b] = pair.photos.map(|p| long_side(&photos[p as usize]));
     let threshold = options.max_epipolar_error * 0.5 * (1.0 / a + 1.0 / b);
     let limits = Limits {
-        samples: SAMPLES,
+        samples: MAX_SAMPLES,
         confidence: CONFIDENCE,
         seed: seed_of(pair),
     };
@@ -164,7 +170,7 @@ fn fundamental(
         .iter()
         .map(|p| sampson_squared(&best.model, *p) < threshold * threshold)
         .collect();
-    Some(Uncalibrated {
+    Some(UncalibratedPair {
         pair: index,
         matrix: best.model,
         count: best.inliers,
@@ -178,11 +184,11 @@ pub(super) fn essential_from(fundamental: DMat3, focal_a: f64, focal_b: f64) -> 
     closest_essential(scale(focal_b) * fundamental * scale(focal_a))
 }
 
-fn calibrated(
+fn verify_calibrated(
     photos: &[PhotoInfo],
     features: &[Features],
     pair: &PairMatches,
-    uncalibrated: Option<&Uncalibrated>,
+    uncalibrated: Option<&UncalibratedPair>,
     cameras: &Cameras,
     options: &MapOptions,
 ) -> Option<VerifiedPair> {
@@ -197,7 +203,7 @@ fn calibrated(
         DVec2::new((at.x - cx) / fx, (at.y - cy) / fy)
     };
     let [features_a, features_b] = pair.photos.map(|p| &features[p as usize]);
-    let on_planes = |matches: &[[u32; 2]]| -> Vec<[DVec2; 2]> {
+    let normalized = |matches: &[[u32; 2]]| -> Vec<[DVec2; 2]> {
         matches
             .iter()
             .map(|[i, j]| {
@@ -208,14 +214,14 @@ fn calibrated(
             })
             .collect()
     };
-    let all = Correspondences::new(on_planes(&pair.matches));
+    let all = Correspondences::new(normalized(&pair.matches));
     let threshold = options.max_epipolar_error * 0.5 * (1.0 / camera_a.focal() + 1.0 / camera_b.focal());
     let problem = Essential {
         points: &all,
         threshold,
     };
     let limits = Limits {
-        samples: SAMPLES,
+        samples: MAX_SAMPLES,
         confidence: CONFIDENCE,
         seed: seed_of(pair),
     };
@@ -227,7 +233,7 @@ fn calibrated(
     let mut inliers = problem.inliers(&best.model);
     let mut count = inliers.iter().filter(|i| **i).count();
     let better = uncalibrated.filter(|uncalibrated| {
-        group.iter().any(|g| g.1 != Source::Prior) && uncalibrated.count as f64 > 1.2 * count as f64
+        group.iter().any(|g| g.1 != FocalSource::Prior) && uncalibrated.count as f64 > 1.2 * count as f64
     });
     if let Some(uncalibrated) = better {
         // The guessed focal length is off: the inliers of the fundamental matrix are used.
@@ -245,32 +251,32 @@ fn calibrated(
     let mut kept: Vec<[DVec2; 2]> = select(&all.points, &inliers);
     let mut motion = refined(motion_in_front(best.model, kept.iter()).0, &kept);
     let mut angle = median_angle(&motion, &kept);
-    if options.guided && angle >= LEAST_ANGLE && !(camera_a.fisheye || camera_b.fisheye) {
+    if options.guided && angle >= MIN_PARALLAX_RADIANS && !(camera_a.fisheye || camera_b.fisheye) {
         let fundamental = match better {
             Some(uncalibrated) => {
                 let [a, b] = pair.photos.map(|p| to_centered(&photos[p as usize]));
                 b.transpose() * uncalibrated.matrix * a
             }
-            None => to_plane(camera_b).transpose() * motion.essential() * to_plane(camera_a),
+            None => inverse_calibration(camera_b).transpose() * motion.essential() * inverse_calibration(camera_a),
         };
         let guided = match_guided(
             features_a,
             features_b,
-            &TwoView::Fundamental(fundamental),
-            OFF_LINE * options.max_epipolar_error,
+            &TwoViewGeometry::Fundamental(fundamental),
+            GUIDED_DISTANCE_RATIO * options.max_epipolar_error,
             &MatchOptions::default(),
         );
         if guided.len() > matches.len() {
-            kept = on_planes(&guided);
+            kept = normalized(&guided);
             motion = refined(motion, &kept);
             angle = median_angle(&motion, &kept);
             matches = guided;
         }
     }
-    let kind = if angle < LEAST_ANGLE {
+    let kind = if angle < MIN_PARALLAX_RADIANS {
         PairKind::Rotation
     } else {
-        kind(&kept, threshold, pair)
+        classify(&kept, threshold, pair)
     };
     Some(VerifiedPair {
         photos: pair.photos,
@@ -282,7 +288,7 @@ fn calibrated(
 }
 
 /// Maps homogeneous pixels to the plane z = 1, ignoring distortion.
-pub(super) fn to_plane(camera: &DCamera) -> DMat3 {
+pub(super) fn inverse_calibration(camera: &DCamera) -> DMat3 {
     let [fx, fy, cx, cy, ..] = camera.parameters;
     DMat3::from_cols(
         DVec3::new(1.0 / fx, 0.0, 0.0),
@@ -308,8 +314,8 @@ pub(super) fn select<T: Clone>(items: &[T], keep: &[bool]) -> Vec<T> {
 }
 
 /// The kind of a pair from the inliers of its essential matrix.
-fn kind(points: &[[DVec2; 2]], threshold: f64, pair: &PairMatches) -> PairKind {
-    let explained = EXPLAINS * points.len() as f64;
+fn classify(points: &[[DVec2; 2]], threshold: f64, pair: &PairMatches) -> PairKind {
+    let min_explained = MIN_EXPLAINED_FRACTION * points.len() as f64;
     let all = Correspondences::new(points.to_vec());
     let limits = Limits {
         samples: 50,
@@ -326,12 +332,12 @@ fn kind(points: &[[DVec2; 2]], threshold: f64, pair: &PairMatches) -> PairKind {
     ) else {
         return PairKind::General;
     };
-    if (plane.inliers as f64) < explained {
+    if (plane.inliers as f64) < min_explained {
         return PairKind::General;
     }
     // The second fit leaves out what does not follow the turn. The threshold is doubled because the lens may still be unknown.
-    let turned = turned(points, &[2.0 * threshold], 2.0 * threshold);
-    if turned as f64 >= explained {
+    let rotated = count_rotation_inliers(points, &[2.0 * threshold], 2.0 * threshold);
+    if rotated as f64 >= min_explained {
         PairKind::Rotation
     } else {
         PairKind::Planar

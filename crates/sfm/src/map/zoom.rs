@@ -10,98 +10,105 @@
 //! becomes its own camera. For four captures whose photographs were cropped to 65 to 100 % of their width and scaled back, the cost falls
 //! by 35 to 70 % and the focal lengths are 8 to 14 % from their median; for twenty unmodified captures, at most 8 % and 2.3 %.
 
-use super::focal::are_alike;
+use super::focal::are_similar;
 use super::observable::determines_focal;
 use super::readjust::{self, posed};
 use super::types::{Model, PhotoInfo, Zoom};
-use crate::adjust::{AdjustedCamera, Belief, Focal, Freedom};
+use crate::adjust::{AdjustedCamera, Focal, Freedom, Prior};
 use crate::geometry::camera::DCamera;
 use crate::{Features, median};
 
 /// Minimum number of photographs in a cluster: fewer hardly determine a camera.
-const LEAST: usize = 3;
+const MIN_CLUSTER_PHOTOS: usize = 3;
 /// Maximum ratio of the focal lengths of two models: that of a model that follows something moving in front of the scene is arbitrary.
-const FARTHEST: f64 = 2.5;
+const MAX_FOCAL_RATIO: f64 = 2.5;
 /// Minimum number of photographs of a model whose focal length is compared with another model's.
-const ALONE: usize = 8;
+const MIN_COMPARED_PHOTOS: usize = 8;
 /// The same, relative to the number in the largest model: for fewer the scene is not mapped again.
-const PART: f64 = 0.1;
+const MIN_COMPARED_FRACTION: f64 = 0.1;
 /// Minimum ratio of the focal lengths of two clusters.
-const APART: f64 = 1.2;
+const MIN_FOCAL_RATIO: f64 = 1.2;
 /// Minimum gap between the two clusters, relative to the distance of their medians. Along a drone's film of 90 frames without a zoom,
 /// focal lengths drift from 590 to 946 px, and the cost falls by 40 %: split at the 63rd frame, its camera jumps there by 32 times the
 /// usual step.
-const GAP: f64 = 0.25;
+const MIN_CLUSTER_GAP: f64 = 0.25;
 /// Maximum mean distance of the photographs from the median of their cluster, relative to the distance of the two medians.
-const SCATTER: f64 = 0.15;
+const MAX_CLUSTER_SCATTER: f64 = 0.15;
 /// Minimum fraction by which the cost falls with a focal length for each photograph.
-const BETTER: f64 = 0.02;
+const MIN_COST_REDUCTION: f64 = 0.02;
 /// Minimum fraction by which the cost falls, and minimum median logarithmic distance of the focal lengths from their median, for each
 /// photograph to get its own focal length.
-const MUCH: f64 = 0.25;
-const VARIES: f64 = 0.05;
+const MIN_OWN_COST_REDUCTION: f64 = 0.25;
+const MIN_OWN_FOCAL_DEVIATION: f64 = 0.05;
 /// Cost of a change of a focal length by half, as a squared error, px^2.
-const BELIEF: f64 = 10.0;
+const PRIOR_COST: f64 = 10.0;
 
 /// How the focal lengths of a model's photographs are distributed.
-pub(super) enum Focals {
+pub(super) enum FocalDistribution {
     /// Photographs of one camera have one focal length.
     Shared,
     /// The photographs of one camera form two clusters: the smaller one becomes a new group.
-    Parted(Zoom),
+    Clustered(Zoom),
     /// They differ from photograph to photograph.
     Own,
 }
 
 /// The distribution of the focal lengths of a model's photographs when each is given its own.
-pub(super) fn find(photos: &[PhotoInfo], features: &[Features], model: &Model) -> Focals {
+pub(super) fn focal_distribution(photos: &[PhotoInfo], features: &[Features], model: &Model) -> FocalDistribution {
     let groups = model.cameras.len();
     let of_group =
         |group: usize| (0..photos.len()).filter(move |p| photos[*p].group == group && model.poses[*p].is_some());
-    if (0..groups).all(|group| of_group(group).count() < 2 * LEAST) {
-        return Focals::Shared;
+    if (0..groups).all(|group| of_group(group).count() < 2 * MIN_CLUSTER_PHOTOS) {
+        return FocalDistribution::Shared;
     }
-    let (focals, fall) = own_focals(photos, features, model);
-    if fall <= BETTER {
-        return Focals::Shared;
+    let (focals, cost_reduction) = own_focals(photos, features, model);
+    if cost_reduction <= MIN_COST_REDUCTION {
+        return FocalDistribution::Shared;
     }
     let sorted = |group: usize| {
-        let mut of: Vec<(f64, usize)> = of_group(group).map(|p| (focals[p].ln(), p)).collect();
-        of.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-        of
+        let mut logs: Vec<(f64, usize)> = of_group(group).map(|p| (focals[p].ln(), p)).collect();
+        logs.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        logs
     };
-    let parted = (0..groups).find_map(|group| {
-        let of = sorted(group);
-        let (cut, medians) = clusters(&of)?;
-        let (short, long) = of.split_at(cut);
+    let clustered = (0..groups).find_map(|group| {
+        let sorted = sorted(group);
+        let (split, medians) = clusters(&sorted)?;
+        let (short, long) = sorted.split_at(split);
         // The larger cluster keeps the camera.
-        let fewer = usize::from(long.len() <= short.len());
-        let mut zoomed: Vec<usize> = [short, long][fewer].iter().map(|p| p.1).collect();
+        let smaller = usize::from(long.len() <= short.len());
+        let mut zoomed: Vec<usize> = [short, long][smaller].iter().map(|p| p.1).collect();
         zoomed.sort_unstable();
         Some(Zoom {
-            of: group,
+            previous_group: group,
             group: groups,
             photos: zoomed,
-            focals: [medians[1 - fewer].exp(), medians[fewer].exp()],
+            focals: [medians[1 - smaller].exp(), medians[smaller].exp()],
         })
     });
     let varies = |group: usize| {
-        let of = sorted(group);
-        let middle = of.get(of.len() / 2).map_or(0.0, |v| v.0);
-        of.len() >= 2 * LEAST && median(of.iter().map(|v| (v.0 - middle).abs()).collect()).is_some_and(|m| m > VARIES)
+        let logs = sorted(group);
+        let middle = logs.get(logs.len() / 2).map_or(0.0, |v| v.0);
+        logs.len() >= 2 * MIN_CLUSTER_PHOTOS
+            && median(logs.iter().map(|v| (v.0 - middle).abs()).collect()).is_some_and(|m| m > MIN_OWN_FOCAL_DEVIATION)
     };
     // A lens that is known from metadata or from a rig is not given up.
-    let untold = |photo: &PhotoInfo| photo.focal_prior_px.is_none() && photo.camera.is_none() && photo.mount.is_none();
-    match parted {
-        Some(zoom) => Focals::Parted(zoom),
-        None if fall > MUCH && photos.iter().all(untold) && (0..groups).any(varies) => Focals::Own,
-        None => Focals::Shared,
+    let has_no_metadata =
+        |photo: &PhotoInfo| photo.focal_prior_px.is_none() && photo.camera.is_none() && photo.mount.is_none();
+    match clustered {
+        Some(zoom) => FocalDistribution::Clustered(zoom),
+        None if cost_reduction > MIN_OWN_COST_REDUCTION
+            && photos.iter().all(has_no_metadata)
+            && (0..groups).any(varies) =>
+        {
+            FocalDistribution::Own
+        }
+        None => FocalDistribution::Shared,
     }
 }
 
 /// Photographs of one camera that are in a separate model with another focal length: they were zoomed so far that too few pairs with the
 /// others agree with one focal length. `None` if there are none.
-pub(super) fn between(photos: &[PhotoInfo], models: &[Model]) -> Option<Zoom> {
+pub(super) fn between_models(photos: &[PhotoInfo], models: &[Model]) -> Option<Zoom> {
     let (first, others) = models.split_first()?;
     let groups = first.cameras.len();
     let mut candidates = others
@@ -111,14 +118,16 @@ pub(super) fn between(photos: &[PhotoInfo], models: &[Model]) -> Option<Zoom> {
         let focals = [free_focal(first, group)?, free_focal(other, group)?];
         let own = |p: &usize| photos[*p].group == group && other.poses[*p].is_some();
         let zoomed: Vec<usize> = (0..photos.len()).filter(own).collect();
-        let apart = (focals[1] / focals[0]).ln().abs();
-        let enough = ALONE.max((PART * first.registered() as f64) as usize);
-        ((APART.ln()..FARTHEST.ln()).contains(&apart) && zoomed.len() >= enough).then_some(Zoom {
-            of: group,
-            group: groups,
-            photos: zoomed,
-            focals,
-        })
+        let log_ratio = (focals[1] / focals[0]).ln().abs();
+        let min_photos = MIN_COMPARED_PHOTOS.max((MIN_COMPARED_FRACTION * first.registered() as f64) as usize);
+        ((MIN_FOCAL_RATIO.ln()..MAX_FOCAL_RATIO.ln()).contains(&log_ratio) && zoomed.len() >= min_photos).then_some(
+            Zoom {
+                previous_group: group,
+                group: groups,
+                photos: zoomed,
+                focals,
+            },
+        )
     })
 }
 
@@ -130,9 +139,9 @@ pub(super) fn is_confirmed(photos: &[PhotoInfo], features: &[Features], models: 
     };
     let agrees = |group: &usize| {
         let found = free_focal(first, *group);
-        let large = others.iter().filter(|other| other.registered() >= ALONE);
+        let large = others.iter().filter(|other| other.registered() >= MIN_COMPARED_PHOTOS);
         let others = large.filter_map(|other| free_focal(other, *group));
-        found.is_some_and(|focal| others.into_iter().any(|other| are_alike(focal, other)))
+        found.is_some_and(|focal| others.into_iter().any(|other| are_similar(focal, other)))
     };
     let mut groups = 0..first.cameras.len();
     groups.any(|group| agrees(&group) && determines_focal(photos, features, first, group))
@@ -145,10 +154,10 @@ fn free_focal(model: &Model, group: usize) -> Option<f64> {
 }
 
 /// Whether the focal lengths of both cameras of `zoom` still differ enough in `models`, which were mapped with it.
-pub(super) fn holds(zoom: &Zoom, models: &[Model]) -> bool {
-    let focals = [zoom.of, zoom.group].map(|group| camera(models, group).map(DCamera::focal));
+pub(super) fn is_distinct(zoom: &Zoom, models: &[Model]) -> bool {
+    let focals = [zoom.previous_group, zoom.group].map(|group| camera(models, group).map(DCamera::focal));
     match focals {
-        [Some(a), Some(b)] => (b / a).ln().abs() > APART.ln(),
+        [Some(a), Some(b)] => (b / a).ln().abs() > MIN_FOCAL_RATIO.ln(),
         _ => false,
     }
 }
@@ -160,28 +169,28 @@ pub(super) fn camera(models: &[Model], group: usize) -> Option<&DCamera> {
 
 /// The index at which sorted values split into two clusters, and the medians of both; `None` if they do not.
 fn clusters(sorted: &[(f64, usize)]) -> Option<(usize, [f64; 2])> {
-    let middle = |part: &[(f64, usize)]| median(part.iter().map(|v| v.0).collect());
+    let median_of = |part: &[(f64, usize)]| median(part.iter().map(|v| v.0).collect());
     let mut best: Option<(f64, usize, [f64; 2])> = None;
-    for cut in LEAST..(sorted.len() + 1).saturating_sub(LEAST) {
-        let (low, high) = sorted.split_at(cut);
-        let medians = [middle(low)?, middle(high)?];
-        let off = |part: &[(f64, usize)], median: f64| part.iter().map(|v| (v.0 - median).abs()).sum::<f64>();
-        let scatter = off(low, medians[0]) + off(high, medians[1]);
-        if best.is_none_or(|(least, ..)| scatter < least) {
-            best = Some((scatter, cut, medians));
+    for split in MIN_CLUSTER_PHOTOS..(sorted.len() + 1).saturating_sub(MIN_CLUSTER_PHOTOS) {
+        let (low, high) = sorted.split_at(split);
+        let medians = [median_of(low)?, median_of(high)?];
+        let deviation = |part: &[(f64, usize)], median: f64| part.iter().map(|v| (v.0 - median).abs()).sum::<f64>();
+        let scatter = deviation(low, medians[0]) + deviation(high, medians[1]);
+        if best.is_none_or(|(lowest, ..)| scatter < lowest) {
+            best = Some((scatter, split, medians));
         }
     }
-    let (scatter, cut, medians) = best?;
-    let apart = medians[1] - medians[0];
-    let gap = sorted[cut].0 - sorted[cut - 1].0;
-    let is_clear = gap >= GAP * apart && scatter / sorted.len() as f64 <= SCATTER * apart;
-    (apart > APART.ln() && is_clear).then_some((cut, medians))
+    let (scatter, split, medians) = best?;
+    let distance = medians[1] - medians[0];
+    let gap = sorted[split].0 - sorted[split - 1].0;
+    let is_clear = gap >= MIN_CLUSTER_GAP * distance && scatter / sorted.len() as f64 <= MAX_CLUSTER_SCATTER * distance;
+    (distance > MIN_FOCAL_RATIO.ln() && is_clear).then_some((split, medians))
 }
 
 /// `[photos]` the focal length of each photograph, px, if each has its own, and the fraction by which the cost falls.
 fn own_focals(photos: &[PhotoInfo], features: &[Features], model: &Model) -> (Vec<f64>, f64) {
     let camera = |photo: usize| model.cameras[photos[photo].group].as_ref();
-    let cameras = posed(model).map(|photo| alone(camera(photo).expect("a posed photograph has a camera")));
+    let cameras = posed(model).map(|photo| own_camera(camera(photo).expect("a posed photograph has a camera")));
     let mut number = vec![usize::MAX; photos.len()];
     posed(model).enumerate().for_each(|(i, photo)| number[photo] = i);
     let mut problem = readjust::problem(photos, features, model, cameras.collect(), |photo| number[photo]);
@@ -190,25 +199,29 @@ fn own_focals(photos: &[PhotoInfo], features: &[Features], model: &Model) -> (Ve
         let camera = problem.cameras.get(*number);
         camera.map_or(f64::NAN, |camera| camera.camera.focal())
     };
-    let fall = 1.0 - report.final_cost / report.initial_cost;
+    let cost_reduction = 1.0 - report.final_cost / report.initial_cost;
     (
         number.iter().map(focal).collect(),
-        if fall.is_finite() { fall } else { 0.0 },
+        if cost_reduction.is_finite() {
+            cost_reduction
+        } else {
+            0.0
+        },
     )
 }
 
 /// A photograph's own camera, whose focal length is free.
-fn alone(camera: &DCamera) -> AdjustedCamera {
-    let mut belief = Belief::default();
-    belief.values[0] = camera.focal();
-    belief.weights[0] = BELIEF / (0.5 * camera.focal()).powi(2);
+fn own_camera(camera: &DCamera) -> AdjustedCamera {
+    let mut prior = Prior::default();
+    prior.values[0] = camera.focal();
+    prior.weights[0] = PRIOR_COST / (0.5 * camera.focal()).powi(2);
     AdjustedCamera {
         camera: *camera,
         freedom: Freedom {
             focal: Focal::Tied,
             ..Freedom::HELD
         },
-        belief,
+        prior,
     }
 }
 
@@ -221,7 +234,7 @@ mod tests {
         let of = |values: &[f64]| {
             let mut sorted: Vec<(f64, usize)> = values.iter().enumerate().map(|(i, v)| (v.ln(), i)).collect();
             sorted.sort_by(|a, b| a.0.total_cmp(&b.0));
-            clusters(&sorted).map(|(cut, medians)| (cut, medians.map(|m| m.exp().round())))
+            clusters(&sorted).map(|(split, medians)| (split, medians.map(|m| m.exp().round())))
         };
         assert_eq!(
             of(&[500.0, 800.0, 505.0, 790.0, 495.0, 810.0, 500.0]),

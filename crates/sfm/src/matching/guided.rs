@@ -1,4 +1,4 @@
-use super::{Descriptor, MatchOptions, comparable, joined, mutual};
+use super::{Descriptor, MatchOptions, comparable_descriptors, merge_matches, mutual_matches};
 use crate::Features;
 use glam::{DMat3, DVec3};
 use irradia_compute::nearest::Nearest;
@@ -6,7 +6,7 @@ use irradia_compute::simd::{Kernel, Lanes, Mask, Simd};
 
 /// The known geometry of a pair, in pixels at full size.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum TwoView {
+pub enum TwoViewGeometry {
     /// `x2^T F x1 = 0`.
     Fundamental(DMat3),
     /// `x2 ~ H x1`.
@@ -19,41 +19,45 @@ pub enum TwoView {
 pub fn match_guided(
     a: &Features,
     b: &Features,
-    geometry: &TwoView,
+    geometry: &TwoViewGeometry,
     threshold: f64,
     options: &MatchOptions,
 ) -> Vec<[u32; 2]> {
-    let search = Search::new(b, geometry, threshold);
+    let columns = KeypointColumns::new(b, geometry, threshold);
     let none = |photo: &Features| vec![Nearest::NONE; photo.keypoints.len()];
-    let mut kinds: Vec<_> = comparable(a, b).map(|both| (both, [none(a), none(b)])).collect();
-    let mut near: Vec<u32> = Vec::new();
+    let mut kinds: Vec<_> = comparable_descriptors(a, b)
+        .map(|both| (both, [none(a), none(b)]))
+        .collect();
+    let mut candidates: Vec<u32> = Vec::new();
     for (i, keypoint) in a.keypoints.iter().enumerate() {
         let x1 = DVec3::new(keypoint.x.into(), keypoint.y.into(), 1.0);
-        near.clear();
-        options.level.run(Along {
-            search: &search,
+        candidates.clear();
+        options.level.run(FindCandidates {
+            columns: &columns,
             x1,
-            near: &mut near,
+            candidates: &mut candidates,
         });
         for ([a, b], [of_a, of_b]) in &mut kinds {
-            for &j in &near {
-                let product = product(&a[i], &b[j as usize]);
+            for &j in &candidates {
+                let product = dot_product(&a[i], &b[j as usize]);
                 of_a[i].merge(j, product, 0);
                 of_b[j as usize].merge(i as u32, product, 0);
             }
         }
     }
-    let matches = kinds.iter().map(|(_, [of_a, of_b])| mutual(of_a, of_b, options));
-    matches.reduce(joined).unwrap_or_default()
+    let matches = kinds
+        .iter()
+        .map(|(_, [of_a, of_b])| mutual_matches(of_a, of_b, options));
+    matches.reduce(merge_matches).unwrap_or_default()
 }
 
-fn product(a: &Descriptor, b: &Descriptor) -> u32 {
+fn dot_product(a: &Descriptor, b: &Descriptor) -> u32 {
     a.iter().zip(b).map(|(a, b)| u32::from(*a) * u32::from(*b)).sum()
 }
 
 /// The second photograph's keypoints, in columns padded to whole vectors.
-struct Search {
-    geometry: TwoView,
+struct KeypointColumns {
+    geometry: TwoViewGeometry,
     /// Squared pixels.
     threshold2: f32,
     x: Vec<f32>,
@@ -63,8 +67,8 @@ struct Search {
     count: usize,
 }
 
-impl Search {
-    fn new(b: &Features, geometry: &TwoView, threshold: f64) -> Self {
+impl KeypointColumns {
+    fn new(b: &Features, geometry: &TwoViewGeometry, threshold: f64) -> Self {
         let count = b.keypoints.len();
         let padded = |value: &dyn Fn(usize) -> f32| -> Vec<f32> {
             let mut column: Vec<f32> = (0..count).map(value).collect();
@@ -73,19 +77,19 @@ impl Search {
         };
         // F is defined up to scale.
         let geometry = match *geometry {
-            TwoView::Fundamental(f) => {
+            TwoViewGeometry::Fundamental(f) => {
                 let largest = f.to_cols_array().iter().fold(0.0f64, |a, b| a.max(b.abs()));
-                TwoView::Fundamental(f * (1.0 / largest.max(f64::MIN_POSITIVE)))
+                TwoViewGeometry::Fundamental(f * (1.0 / largest.max(f64::MIN_POSITIVE)))
             }
             other => other,
         };
         let gradient2 = |j: usize| match geometry {
-            TwoView::Fundamental(f) => {
+            TwoViewGeometry::Fundamental(f) => {
                 let keypoint = b.keypoints[j];
                 let line = f.transpose() * DVec3::new(keypoint.x.into(), keypoint.y.into(), 1.0);
                 line.truncate().length_squared() as f32
             }
-            TwoView::Homography(_) => 0.0,
+            TwoViewGeometry::Homography(_) => 0.0,
         };
         Self {
             geometry,
@@ -99,45 +103,49 @@ impl Search {
 }
 
 /// Finds the keypoints that agree with `x1`, ascending.
-struct Along<'a> {
-    search: &'a Search,
+struct FindCandidates<'a> {
+    columns: &'a KeypointColumns,
     /// Homogeneous, pixels.
     x1: DVec3,
-    near: &'a mut Vec<u32>,
+    candidates: &'a mut Vec<u32>,
 }
 
-impl Kernel for Along<'_> {
+impl Kernel for FindCandidates<'_> {
     type Output = ();
     #[inline(always)]
     fn run<S: Simd>(self, simd: S)
     where
         S::F: Lanes<Scalar = f32>,
     {
-        let Self { search, x1, near } = self;
+        let Self {
+            columns,
+            x1,
+            candidates,
+        } = self;
         let set = |value: f64| simd.set(value as f32);
-        let limit = simd.set(search.threshold2);
-        for at in (0..search.count).step_by(S::LANES) {
-            let (x, y) = (simd.load(&search.x[at..]), simd.load(&search.y[at..]));
-            let agree = match search.geometry {
-                TwoView::Fundamental(f) => {
+        let limit = simd.set(columns.threshold2);
+        for at in (0..columns.count).step_by(S::LANES) {
+            let (x, y) = (simd.load(&columns.x[at..]), simd.load(&columns.y[at..]));
+            let agree = match columns.geometry {
+                TwoViewGeometry::Fundamental(f) => {
                     // The epipolar line with a unit normal keeps distances small.
                     let line = f * x1;
                     let length2 = line.truncate().length_squared().max(f64::MIN_POSITIVE);
                     let unit = line / length2.sqrt();
                     let distance = x * set(unit.x) + y * set(unit.y) + set(unit.z);
-                    let weight = simd.load(&search.gradient2[at..]) * set(1.0 / length2) + simd.splat(1.0);
+                    let weight = simd.load(&columns.gradient2[at..]) * set(1.0 / length2) + simd.splat(1.0);
                     (distance * distance).le(weight * limit)
                 }
-                TwoView::Homography(h) => {
+                TwoViewGeometry::Homography(h) => {
                     let mapped = h * x1;
                     let (dx, dy) = (x - set(mapped.x / mapped.z), y - set(mapped.y / mapped.z));
                     (dx * dx + dy * dy).le(limit)
                 }
             };
-            let valid = (search.count - at).min(S::LANES);
+            let valid = (columns.count - at).min(S::LANES);
             let mut bits = agree.bits() & ((1u32 << valid) - 1);
             while bits != 0 {
-                near.push(at as u32 + bits.trailing_zeros());
+                candidates.push(at as u32 + bits.trailing_zeros());
                 bits &= bits - 1;
             }
         }
@@ -180,8 +188,8 @@ mod tests {
         let expected: Vec<[u32; 2]> = (0..40).map(|i| [i, i]).collect();
         assert!(super::super::match_features(&a, &b, &options).is_empty());
         for geometry in [
-            TwoView::Fundamental(sideways * 1e-4),
-            TwoView::Homography(DMat3::from_translation(glam::DVec2::new(-30.0, 0.0))),
+            TwoViewGeometry::Fundamental(sideways * 1e-4),
+            TwoViewGeometry::Homography(DMat3::from_translation(glam::DVec2::new(-30.0, 0.0))),
         ] {
             for level in irradia_compute::Level::all() {
                 let options = MatchOptions { level, ..options };
@@ -196,9 +204,9 @@ mod tests {
         let a = repeated(&[[1.0, 2.0], [30.0, 4.0]]);
         let nan = DMat3::from_diagonal(DVec3::splat(f64::NAN));
         for geometry in [
-            TwoView::Homography(DMat3::ZERO),
-            TwoView::Homography(nan),
-            TwoView::Fundamental(nan),
+            TwoViewGeometry::Homography(DMat3::ZERO),
+            TwoViewGeometry::Homography(nan),
+            TwoViewGeometry::Fundamental(nan),
         ] {
             assert!(match_guided(&a, &a, &geometry, 4.0, &MatchOptions::default()).is_empty());
         }

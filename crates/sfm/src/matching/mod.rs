@@ -12,13 +12,13 @@ use irradia_compute::nearest::{Nearest, nearest};
 use rayon::prelude::*;
 use std::collections::HashSet;
 
-pub use guided::{TwoView, match_guided};
+pub use guided::{TwoViewGeometry, match_guided};
 pub use pairs::{PairOptions, candidate_pairs};
 
 type Descriptor = [u8; DESCRIPTOR_BYTES];
 
 /// Squared length of a RootSIFT descriptor, apart from rounding.
-const LENGTH2: u32 = 512 * 512;
+const SQUARED_LENGTH: u32 = 512 * 512;
 
 /// When two features match.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -44,27 +44,27 @@ impl Default for MatchOptions {
 impl MatchOptions {
     /// Whether the nearest neighbour is near enough and nearer than all others.
     fn accepts(&self, nearest: &Nearest) -> bool {
-        let [first, second] = [nearest.product, nearest.second].map(distance2);
-        let limit = f64::from(self.distance).powi(2) * f64::from(LENGTH2);
+        let [first, second] = [nearest.product, nearest.second].map(squared_distance);
+        let limit = f64::from(self.distance).powi(2) * f64::from(SQUARED_LENGTH);
         let ratio2 = f64::from(self.ratio).powi(2);
         f64::from(first) <= limit && f64::from(first) < ratio2 * f64::from(second)
     }
 }
 
 /// Squared distance between two descriptors with this inner product.
-fn distance2(product: u32) -> u32 {
-    2 * LENGTH2.saturating_sub(product)
+fn squared_distance(product: u32) -> u32 {
+    2 * SQUARED_LENGTH.saturating_sub(product)
 }
 
 /// Pairs of features, one of `a` and one of `b`, that are each other's nearest and pass the tests of `options`; sorted by the first.
 /// Where both have frontal descriptors, these match the features that the usual ones leave unmatched.
 pub fn match_features(a: &Features, b: &Features, options: &MatchOptions) -> Vec<[u32; 2]> {
-    let matches = comparable(a, b).map(|[a, b]| match_descriptors(a, b, options));
-    matches.reduce(joined).unwrap_or_default()
+    let matches = comparable_descriptors(a, b).map(|[a, b]| match_descriptors(a, b, options));
+    matches.reduce(merge_matches).unwrap_or_default()
 }
 
 /// `[N, 128]` descriptors of two photographs that can be compared: the usual ones, then the frontal ones where both have them.
-fn comparable<'a>(a: &'a Features, b: &'a Features) -> impl Iterator<Item = [&'a [Descriptor]; 2]> {
+fn comparable_descriptors<'a>(a: &'a Features, b: &'a Features) -> impl Iterator<Item = [&'a [Descriptor]; 2]> {
     let usual: [&[Descriptor]; 2] = [&a.descriptors, &b.descriptors];
     let frontal: [&[Descriptor]; 2] = [&a.frontal, &b.frontal];
     let both = frontal.iter().all(|descriptors| !descriptors.is_empty());
@@ -72,22 +72,22 @@ fn comparable<'a>(a: &'a Features, b: &'a Features) -> impl Iterator<Item = [&'a
 }
 
 /// `first`, and the pairs of `second` whose features `first` leaves unmatched; sorted by the first photograph's feature.
-fn joined(first: Vec<[u32; 2]>, second: Vec<[u32; 2]>) -> Vec<[u32; 2]> {
+fn merge_matches(first: Vec<[u32; 2]>, second: Vec<[u32; 2]>) -> Vec<[u32; 2]> {
     let [of_a, of_b]: [HashSet<u32>; 2] = [0, 1].map(|side| first.iter().map(|pair| pair[side]).collect());
-    let left = second
+    let unmatched = second
         .into_iter()
         .filter(|[i, j]| !of_a.contains(i) && !of_b.contains(j));
-    let mut all: Vec<[u32; 2]> = first.into_iter().chain(left).collect();
+    let mut all: Vec<[u32; 2]> = first.into_iter().chain(unmatched).collect();
     all.sort_unstable();
     all
 }
 
 fn match_descriptors(a: &[Descriptor], b: &[Descriptor], options: &MatchOptions) -> Vec<[u32; 2]> {
     let [of_a, of_b] = nearest(options.level, a, b);
-    mutual(&of_a, &of_b, options)
+    mutual_matches(&of_a, &of_b, options)
 }
 
-fn mutual(of_a: &[Nearest], of_b: &[Nearest], options: &MatchOptions) -> Vec<[u32; 2]> {
+fn mutual_matches(of_a: &[Nearest], of_b: &[Nearest], options: &MatchOptions) -> Vec<[u32; 2]> {
     (0u32..)
         .zip(of_a)
         .filter(|(i, nearest)| {

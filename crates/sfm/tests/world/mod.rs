@@ -167,16 +167,16 @@ impl World {
                 k.y = center[1] + ratio * (k.y - center[1]);
             }
         }
-        self.without_what_left()
+        self.without_outside_matches()
     }
 
     /// The world with each photograph cropped around its centre to `keep` times its size: each has its own camera.
-    pub fn cut(self, keep: impl Fn(usize) -> f64) -> Self {
-        self.cut_beside(keep, |_| [0.5; 2])
+    pub fn cropped(self, keep: impl Fn(usize) -> f64) -> Self {
+        self.cropped_beside(keep, |_| [0.5; 2])
     }
 
-    /// Like [`Self::cut`], with the fractions `before` of the cropped width and height removed at the left and at the top.
-    pub fn cut_beside(mut self, keep: impl Fn(usize) -> f64, before: impl Fn(usize) -> [f64; 2]) -> Self {
+    /// Like [`Self::cropped`], with the fractions `before` of the cropped width and height removed at the left and at the top.
+    pub fn cropped_beside(mut self, keep: impl Fn(usize) -> f64, before: impl Fn(usize) -> [f64; 2]) -> Self {
         for (i, (photo, features)) in self.photos.iter_mut().zip(&mut self.features).enumerate() {
             let side = |side: u32| (f64::from(side) * keep(i) / 2.0).round() as u32 * 2;
             (photo.width, photo.height, photo.group) = (side(CAMERA.width), side(CAMERA.height), i);
@@ -186,11 +186,11 @@ impl World {
                 k.y -= above * (CAMERA.height - photo.height) as f32;
             }
         }
-        self.without_what_left()
+        self.without_outside_matches()
     }
 
     /// The world without the matches of keypoints outside their photographs.
-    fn without_what_left(mut self) -> Self {
+    fn without_outside_matches(mut self) -> Self {
         for pair in &mut self.pairs {
             let seen = |side: usize, keypoint: u32| {
                 let photo = pair.photos[side] as usize;

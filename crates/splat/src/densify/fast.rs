@@ -29,19 +29,19 @@ pub struct FastOptions {
 }
 
 /// Frames in which a splat must have been visible before its statistics are used.
-const FRAMES: f32 = 2.0;
+const MIN_FRAMES: f32 = 2.0;
 
 /// Prunes and splits; clears the statistics and restores Morton order.
 pub fn densify(state: &mut SplatState, options: &FastOptions) -> DensityChange {
     let n = state.len();
     let stays = |i: usize| {
         let seen = state.statistics.get(SplatState::SEEN, i);
-        let shows = seen < FRAMES || state.mean_statistic(SplatState::WEIGHT, i) >= options.min_weight;
+        let shows = seen < MIN_FRAMES || state.mean_statistic(SplatState::WEIGHT, i) >= options.min_weight;
         shows && state.splats.opacity(i) >= options.min_opacity && is_finite(&state.splats, i)
     };
     let mut kept = indices(n, stays);
     if kept.len() < options.floor.min(n) {
-        kept = most_shown(state, options.floor);
+        kept = top_by_weight(state, options.floor);
     }
     let left = kept.len();
 
@@ -50,7 +50,7 @@ pub fn densify(state: &mut SplatState, options: &FastOptions) -> DensityChange {
         .par_iter()
         .filter(|i| {
             let i = **i as usize;
-            state.statistics.get(SplatState::SEEN, i) >= FRAMES
+            state.statistics.get(SplatState::SEEN, i) >= MIN_FRAMES
                 && state.statistics.get(SplatState::EXTENT, i) >= options.min_extent
         })
         .map(|i| (state.mean_statistic(SplatState::ERROR, *i as usize), *i))
@@ -72,7 +72,7 @@ pub fn densify(state: &mut SplatState, options: &FastOptions) -> DensityChange {
 }
 
 /// The `count` finite splats with the largest mean weight, in ascending order of index.
-fn most_shown(state: &SplatState, count: usize) -> Vec<u32> {
+fn top_by_weight(state: &SplatState, count: usize) -> Vec<u32> {
     let finite = (0..state.len()).filter(|i| is_finite(&state.splats, *i));
     let mut ranked: Vec<(f32, u32)> = finite
         .map(|i| (state.mean_statistic(SplatState::WEIGHT, i), i as u32))

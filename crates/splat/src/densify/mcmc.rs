@@ -90,7 +90,7 @@ fn replica(opacity: f32, n: usize) -> (f32, f32) {
 }
 
 /// Splats per random stream: one stream per chunk, so that results do not depend on the number of threads.
-const CHUNK: usize = 4096;
+const SPLATS_PER_STREAM: usize = 4096;
 /// Opacity at which the noise has fallen to half, and how steeply it falls (section 3.3).
 const NOISE_OPACITY: f32 = 0.005;
 const NOISE_STEEPNESS: f32 = 100.0;
@@ -100,11 +100,11 @@ const NOISE_STEEPNESS: f32 = 100.0;
 pub fn add_noise(state: &mut SplatState, rate: f32, seed: u64, step: u64) {
     let n = state.len();
     let splats = &state.splats;
-    let offsets: Vec<Vec<(u32, [f32; 3])>> = (0..n.div_ceil(CHUNK))
+    let offsets: Vec<Vec<(u32, [f32; 3])>> = (0..n.div_ceil(SPLATS_PER_STREAM))
         .into_par_iter()
         .map(|chunk| {
             let mut rng = Rng::new(seed ^ step << 24 ^ chunk as u64, STREAM_NOISE);
-            (chunk * CHUNK..n.min((chunk + 1) * CHUNK))
+            (chunk * SPLATS_PER_STREAM..n.min((chunk + 1) * SPLATS_PER_STREAM))
                 .filter_map(|i| {
                     let opacity = splats.opacity(i);
                     let strength = sigmoid(-NOISE_STEEPNESS * (opacity - NOISE_OPACITY));
@@ -130,15 +130,18 @@ pub fn add_noise(state: &mut SplatState, rate: f32, seed: u64, step: u64) {
         .par_chunks_mut(stride)
         .enumerate()
         .for_each(|(c, plane)| {
-            plane.par_chunks_mut(CHUNK).zip(&offsets).for_each(|(means, offsets)| {
-                for (i, offset) in offsets {
-                    let mean = &mut means[*i as usize % CHUNK];
-                    let moved = *mean + offset[c];
-                    if moved.is_finite() {
-                        *mean = moved;
+            plane
+                .par_chunks_mut(SPLATS_PER_STREAM)
+                .zip(&offsets)
+                .for_each(|(means, offsets)| {
+                    for (i, offset) in offsets {
+                        let mean = &mut means[*i as usize % SPLATS_PER_STREAM];
+                        let moved = *mean + offset[c];
+                        if moved.is_finite() {
+                            *mean = moved;
+                        }
                     }
-                }
-            });
+                });
         });
 }
 

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 const RANDOM_SHRINK: f32 = 1.6;
 /// Standard deviation of a half along the split axis, relative to the original's. Two halves at distance sqrt(1 - k^2) from
 /// the centre have the original's variance for any k; at 0.6 their sum is within 5 % of the original's curve inside 2 sigma.
-const HALF: f32 = 0.6;
+const HALF_DEVIATION: f32 = 0.6;
 
 /// The largest standard deviation, world units.
 pub(super) fn largest_scale(splats: &Splats, i: usize) -> f32 {
@@ -51,14 +51,14 @@ pub(super) fn without(kept: Vec<u32>, gone: &[u32]) -> Vec<u32> {
 type Half = (Vec3, [f32; 3], f32);
 
 /// Splats of a parallel task.
-const PIECE: usize = 4096;
+const SPLATS_PER_TASK: usize = 4096;
 
 /// Each of `indices` twice, adjacent, with the changes that `half` returns. The result does not depend on the number of threads.
 fn halves(splats: &Splats, indices: &[u32], half: impl Fn(&Splats, usize, usize) -> Half + Sync) -> Splats {
-    let mut halves = twice(splats, indices);
+    let mut halves = duplicate(splats, indices);
     let changes: Vec<Half> = (0..halves.len())
         .into_par_iter()
-        .with_min_len(PIECE)
+        .with_min_len(SPLATS_PER_TASK)
         .map(|i| half(splats, indices[i / 2] as usize, i))
         .collect();
     for c in 0..3 {
@@ -68,7 +68,7 @@ fn halves(splats: &Splats, indices: &[u32], half: impl Fn(&Splats, usize, usize)
             .par_iter_mut()
             .zip(log_scales)
             .zip(&changes)
-            .with_min_len(PIECE)
+            .with_min_len(SPLATS_PER_TASK)
             .for_each(|((mean, log_scale), (offset, log_scales, _))| {
                 *mean += offset[c];
                 *log_scale = log_scales[c];
@@ -106,11 +106,11 @@ pub(super) fn long_axis_halves(splats: &Splats, indices: &[u32]) -> Splats {
         let axis = (0..3)
             .max_by(|a, b| log_scales[*a].total_cmp(&log_scales[*b]))
             .expect("three axes");
-        let distance = log_scales[axis].exp() * (1.0 - HALF * HALF).sqrt();
+        let distance = log_scales[axis].exp() * (1.0 - HALF_DEVIATION * HALF_DEVIATION).sqrt();
         let mut offset = Vec3::ZERO;
         offset[axis] = if half % 2 == 0 { distance } else { -distance };
-        log_scales[axis] += HALF.ln();
-        let opacity = splats.opacity(i) / (2.0 * HALF);
+        log_scales[axis] += HALF_DEVIATION.ln();
+        let opacity = splats.opacity(i) / (2.0 * HALF_DEVIATION);
         (
             rotation(splats, i) * offset,
             log_scales,
@@ -123,7 +123,7 @@ fn log_scales(splats: &Splats, i: usize) -> [f32; 3] {
     std::array::from_fn(|c| splats.log_scales.get(c, i))
 }
 
-fn twice(splats: &Splats, indices: &[u32]) -> Splats {
+fn duplicate(splats: &Splats, indices: &[u32]) -> Splats {
     let doubled: Vec<u32> = indices.iter().flat_map(|i| [*i, *i]).collect();
     splats.gather(&doubled)
 }
@@ -159,15 +159,15 @@ pub(super) fn draw_distinct(weights: &[f32], count: usize, rng: &mut Rng) -> Vec
     let start = *rng;
     rng.advance(weights.len() as u64);
     let mut keys: Vec<(f32, u32)> = weights
-        .par_chunks(PIECE)
+        .par_chunks(SPLATS_PER_TASK)
         .enumerate()
         .flat_map_iter(|(piece, weights)| {
             let mut rng = start;
-            rng.advance((piece * PIECE) as u64);
+            rng.advance((piece * SPLATS_PER_TASK) as u64);
             weights.iter().enumerate().filter_map(move |(i, w)| {
                 // The logarithm of the key; one random number per item, so that a weight does not affect other items' keys.
                 let u = rng.uniform().max(f32::MIN_POSITIVE).ln();
-                (*w > 0.0 && w.is_finite()).then(|| (u / w, (piece * PIECE + i) as u32))
+                (*w > 0.0 && w.is_finite()).then(|| (u / w, (piece * SPLATS_PER_TASK + i) as u32))
             })
         })
         .collect();
@@ -216,7 +216,7 @@ mod tests {
     /// Compares with one splat, and one random number, after the other.
     #[test]
     fn random_halves_and_draws_are_those_of_one_thread() {
-        let n = 3 * PIECE + 7;
+        let n = 3 * SPLATS_PER_TASK + 7;
         let mut splats = Splats::zeros(n, 0);
         let mut rng = Rng::new(2, 2);
         for i in 0..n {

@@ -45,7 +45,7 @@ pub struct ScoreWeights {
 }
 
 /// Added to scores before inversion, to avoid division by zero.
-const SCORE_FLOOR: f32 = 1e-6;
+const SCORE_EPSILON: f32 = 1e-6;
 
 /// Number of splats after a round, starting from `now`: on the parabola that rises fastest at first and has its vertex at `last`
 /// when the stage ends (eq. 2). `completed` is the fraction of the stage completed, now and at the previous round.
@@ -65,19 +65,19 @@ pub fn densify(state: &mut SplatState, options: &TamingOptions, rng: &mut Rng) -
     }
     let scores = scores(state, &options.weights);
     let [clone, split] = select(state, options, &scores, rng);
-    let mut removed = removed(state, options, &scores, rng);
+    let mut pruned = select_pruned(state, options, &scores, rng);
     // Splats that were split are already gone.
-    removed.retain(|i| split.binary_search(i).is_err());
+    pruned.retain(|i| split.binary_search(i).is_err());
     let halves = random_halves(&state.splats, &split, rng);
     let clones = state.splats.gather(&clone);
-    let mut gone = [&split[..], &removed[..]].concat();
+    let mut gone = [&split[..], &pruned[..]].concat();
     gone.sort_unstable();
     let left = without((0..state.len() as u32).collect(), &gone);
     state.rebuild(left, &[&clones, &halves], &[]);
     DensityChange {
         cloned: clone.len(),
         split: split.len(),
-        pruned: n - finite.len() + removed.len(),
+        pruned: n - finite.len() + pruned.len(),
     }
 }
 
@@ -100,7 +100,7 @@ fn select(state: &SplatState, options: &TamingOptions, scores: &[f32], rng: &mut
 
 /// Splats to remove, ascending: half as many splats as are faint or oversized are drawn from all, preferably those with low scores;
 /// of those drawn, the faint or oversized ones are removed.
-fn removed(state: &SplatState, options: &TamingOptions, scores: &[f32], rng: &mut Rng) -> Vec<u32> {
+fn select_pruned(state: &SplatState, options: &TamingOptions, scores: &[f32], rng: &mut Rng) -> Vec<u32> {
     if !options.prunes {
         return Vec::new();
     }
@@ -110,7 +110,7 @@ fn removed(state: &SplatState, options: &TamingOptions, scores: &[f32], rng: &mu
             || options.max_scale.is_some_and(|limit| largest_scale(splats, i) > limit)
     };
     let count = (0..state.len()).filter(|i| useless(*i)).count() / 2;
-    let weights: Vec<f32> = scores.iter().map(|score| 1.0 / (SCORE_FLOOR + score)).collect();
+    let weights: Vec<f32> = scores.iter().map(|score| 1.0 / (SCORE_EPSILON + score)).collect();
     let mut drawn = draw_distinct(&weights, count, rng);
     drawn.retain(|i| useless(*i as usize));
     drawn

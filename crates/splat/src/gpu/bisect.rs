@@ -19,7 +19,7 @@ const WORDS: usize = 12;
 /// Entries of a segment: with fewer in every tile, the backward pass needs no state of pixels between segments.
 const SEGMENT: usize = 256;
 /// Largest relative difference in a stage's results due to rounding, and to fragments at the threshold of 1/255 that only one side draws.
-const ROUNDING: f64 = 1e-3;
+const ROUNDING_TOLERANCE: f64 = 1e-3;
 
 /// One step of the CPU with the results of each stage, as the shaders arrange them.
 struct Twin {
@@ -228,8 +228,8 @@ impl Twin {
         let (gpu, r) = (&of.renderer.gpu, &of.renderer);
         let n = self.before.len();
         let share = |a: &[u32], b: &[u32]| {
-            let apart = a.iter().zip(b).filter(|(a, b)| a != b).count();
-            apart as f64 / b.len() as f64
+            let differing = a.iter().zip(b).filter(|(a, b)| a != b).count();
+            differing as f64 / b.len() as f64
         };
         let slots = self.slots.len();
         match stage {
@@ -239,7 +239,7 @@ impl Twin {
                     let seen = list.iter().zip(&self.visible).filter(|(_, visible)| **visible > 0);
                     seen.map(|(s, _)| f64::from(s[word])).collect()
                 };
-                let words = (0..WORDS).map(|w| apart(&word(&got, w), &word(&self.footprints, w)));
+                let words = (0..WORDS).map(|w| relative_difference(&word(&got, w), &word(&self.footprints, w)));
                 words
                     .fold(share(&r.visible.to_vec(gpu, n), &self.visible), f64::max)
                     .max(share(&r.touched.to_vec(gpu, n), &self.touched))
@@ -265,7 +265,9 @@ impl Twin {
                 let pixels = self.planes.len() / FRAME_PLANES;
                 let got: Vec<f32> = r.planes.to_vec(gpu, self.planes.len());
                 let planes = got.chunks(pixels).zip(self.planes.chunks(pixels));
-                planes.map(|(a, b)| apart(&wide(a), &wide(b))).fold(0.0, f64::max)
+                planes
+                    .map(|(a, b)| relative_difference(&widen(a), &widen(b)))
+                    .fold(0.0, f64::max)
             }
             "blend_vjp" => {
                 let of_slots: Vec<[f32; WORDS]> = of.sums.to_vec(gpu, WORDS * slots);
@@ -276,7 +278,7 @@ impl Twin {
                     }
                 }
                 let word = |list: &[[f64; WORDS]], word: usize| -> Vec<f64> { list.iter().map(|s| s[word]).collect() };
-                let words = (0..WORDS).map(|w| apart(&word(&got, w), &word(&self.sums[..n], w)));
+                let words = (0..WORDS).map(|w| relative_difference(&word(&got, w), &word(&self.sums[..n], w)));
                 words.fold(0.0, f64::max)
             }
             "project_vjp" => {
@@ -288,7 +290,9 @@ impl Twin {
                 };
                 let expected = self.v_splats();
                 let planes = got.chunks(stride).zip(expected.chunks(stride));
-                planes.map(|(a, b)| apart(&active(a), &active(b))).fold(0.0, f64::max)
+                planes
+                    .map(|(a, b)| relative_difference(&active(a), &active(b)))
+                    .fold(0.0, f64::max)
             }
             _ => {
                 let got = of.download();
@@ -309,19 +313,19 @@ impl Twin {
                     pairs.map(|(a, b)| f64::from(*a) - f64::from(*b)).collect()
                 };
                 let each = got.iter().zip(&after).zip(&before);
-                each.map(|((got, after), before)| apart(&changes(got, before), &changes(after, before)))
+                each.map(|((got, after), before)| relative_difference(&changes(got, before), &changes(after, before)))
                     .fold(0.0, f64::max)
             }
         }
     }
 }
 
-fn wide(values: &[f32]) -> Vec<f64> {
+fn widen(values: &[f32]) -> Vec<f64> {
     values.iter().map(|v| f64::from(*v)).collect()
 }
 
 /// The norm of the difference relative to that of `b`; infinite for NaN.
-fn apart(a: &[f64], b: &[f64]) -> f64 {
+fn relative_difference(a: &[f64], b: &[f64]) -> f64 {
     let norm = |values: &mut dyn Iterator<Item = f64>| values.map(|v| v * v).sum::<f64>().sqrt();
     let difference = norm(&mut a.iter().zip(b).map(|(a, b)| a - b));
     match difference {
@@ -356,7 +360,7 @@ fn v_out<'a>(v_color: &'a [f32], error: &'a [f32]) -> OutputGradient<'a> {
 
 /// The first stage, if any, whose results differ from the twin's although its input does not; and a line per stage with the differences
 /// of this and all later results when the GPU runs from this stage on.
-fn located(gpu: &Arc<Gpu>, faulty: Option<(&str, &str, &str)>) -> (Option<&'static str>, String) {
+fn locate_fault(gpu: &Arc<Gpu>, faulty: Option<(&str, &str, &str)>) -> (Option<&'static str>, String) {
     let twin = Twin::new();
     let mut training = GpuTraining::new(gpu.clone()).unwrap();
     if let Some((kernel, text, instead)) = faulty {
@@ -401,7 +405,7 @@ fn located(gpu: &Arc<Gpu>, faulty: Option<(&str, &str, &str)>) -> (Option<&'stat
             work.submit();
             let distance = twin.distance(stage.name, &training);
             lines += &format!(" {}: {distance:.1e}", stage.name);
-            if stage.name == from.name && distance > ROUNDING {
+            if stage.name == from.name && distance > ROUNDING_TOLERANCE {
                 first.get_or_insert(from.name);
             }
         }
@@ -417,7 +421,7 @@ fn located(gpu: &Arc<Gpu>, faulty: Option<(&str, &str, &str)>) -> (Option<&'stat
 #[test]
 fn every_stage_makes_of_the_twins_input_the_twins_results() {
     let Some(gpu) = gpu() else { return };
-    let (first, lines) = located(&gpu, None);
+    let (first, lines) = locate_fault(&gpu, None);
     println!("{lines}");
     assert_eq!(first, None, "\n{lines}");
 }
@@ -433,7 +437,7 @@ fn a_fault_is_found_at_its_stage() {
         ("project_vjp", "v_x.z += v_depth", "v_x.z -= 0.1 * v_x.x", "project_vjp"),
         ("update_harmonics", "b[k] * v_color[c]", "v_color[c]", "update"),
     ] {
-        let (first, lines) = located(&gpu, Some((kernel, text, instead)));
+        let (first, lines) = locate_fault(&gpu, Some((kernel, text, instead)));
         assert_eq!(first, Some(stage), "{kernel}\n{lines}");
     }
 }

@@ -4,7 +4,7 @@ use crate::render::{FramePlanes, RenderOptions};
 use crate::shaders::Kernels;
 use crate::{Splats, ViewParams};
 use irradia_compute::DeviceError;
-use irradia_compute::gpu::{Array, GROUP, Gpu, PART, Readback, Scan, Sort, Work, flags};
+use irradia_compute::gpu::{Array, Gpu, PART_ALIGN, Readback, Scan, Sort, WORKGROUP_SIZE, Work, flags};
 use std::sync::{Arc, OnceLock};
 
 /// Width and height of a tile, pixels.
@@ -122,7 +122,7 @@ impl GpuRenderer {
     /// When the device refuses one.
     pub fn new(gpu: Arc<Gpu>) -> Result<Self, DeviceError> {
         let array = |label| Array::zeros(&gpu, label, 0);
-        let all_counted = Array::zeros(&gpu, "counts", 2 * PART);
+        let all_counted = Array::zeros(&gpu, "counts", 2 * PART_ALIGN);
         let renderer = Self {
             kernels: Kernels::new(&gpu, ""),
             view: Array::zeros(&gpu, "view", VIEW_WORDS),
@@ -151,7 +151,7 @@ impl GpuRenderer {
             tiles: array("tiles"),
             segment_counts: array("counts of segments"),
             scan: Scan::new(&gpu),
-            counted: [0, PART].map(|at| all_counted.part(at, 4)),
+            counted: [0, PART_ALIGN].map(|at| all_counted.part(at, 4)),
             all_counted,
             room: 0,
             readback: Readback::new(&gpu, 4),
@@ -212,7 +212,7 @@ impl GpuRenderer {
     pub(super) fn draw_whole(&mut self, view: &ViewParams, options: &RenderOptions, trains: bool) {
         loop {
             self.draw(view, options, trains);
-            if self.settle() {
+            if self.finish_frame() {
                 break;
             }
         }
@@ -220,7 +220,7 @@ impl GpuRenderer {
 
     /// Waits for the last frame's numbers of visible splats and of entries. If there was no room for all entries, makes room and returns
     /// `false`: the frame and everything derived from it are void and must be repeated.
-    pub(crate) fn settle(&mut self) -> bool {
+    pub(crate) fn finish_frame(&mut self) -> bool {
         let Some(last) = self.last.as_mut().filter(|_| self.readback.is_pending()) else {
             return true;
         };
@@ -240,7 +240,7 @@ impl GpuRenderer {
     }
 
     /// Submits a frame. The numbers of visible splats and of tile entries stay on the device: arrays have room for the most so far, and
-    /// enough workgroups are dispatched for that many. [`Self::settle`] must follow.
+    /// enough workgroups are dispatched for that many. [`Self::finish_frame`] must follow.
     pub(super) fn draw(&mut self, view: &ViewParams, options: &RenderOptions, trains: bool) {
         let gpu = self.gpu.clone();
         let [count, ..] = self.shape;
@@ -493,7 +493,7 @@ const VIEW_WORDS: usize = 44;
 
 /// Number of workgroups for `items` items.
 fn groups(items: usize) -> usize {
-    items.div_ceil(GROUP as usize)
+    items.div_ceil(WORKGROUP_SIZE as usize)
 }
 
 /// Writes everything but the harmonics, plane by plane, from plane `first` on.

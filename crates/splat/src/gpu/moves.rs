@@ -8,7 +8,7 @@ use super::frame::GEOMETRY;
 use super::training::GpuTraining;
 use crate::{SplatState, Splats};
 use irradia_compute::Planes;
-use irradia_compute::gpu::{Array, GROUP, Gpu, Work};
+use irradia_compute::gpu::{Array, Gpu, WORKGROUP_SIZE, Work};
 use irradia_scene::sh;
 use rayon::prelude::*;
 
@@ -61,7 +61,7 @@ impl GpuTraining {
             ],
             ..SplatState::default()
         };
-        self.download_decisive(&mut state);
+        self.download_density_columns(&mut state);
         state
     }
 
@@ -95,7 +95,7 @@ impl GpuTraining {
             for [column, first, planes] in parts {
                 let words = [count, stride, stride_before, *planes, *first, column * stride, 0, 0];
                 let params = Array::of(&gpu, "move", &words.map(|word| word as u32));
-                let groups = stride.div_ceil(GROUP as usize);
+                let groups = stride.div_ceil(WORKGROUP_SIZE as usize);
                 work.run(kernel, &[&params, numbers, array, spare], groups);
             }
             std::mem::swap(array, spare);

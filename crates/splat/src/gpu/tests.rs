@@ -523,7 +523,7 @@ fn a_step_without_room_changes_nothing_and_its_repetition_is_that_of_a_step_that
         }
         engine.backward(&OutputGradient::of_color(&v_color));
         engine.update(&update);
-        engine.settle()
+        engine.finish_frame()
     };
     assert!(!step(ahead, true), "there is no room for {}", ahead.intersections());
     assert!(*ahead.state() == before, "a void step changes nothing");

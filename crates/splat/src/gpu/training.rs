@@ -6,7 +6,7 @@ use crate::engine::Update;
 use crate::regularize::{Regularized, size_limit};
 use crate::render::{CHUNK, CameraGradient, Gather, OutputGradient, RenderOptions, basis_at};
 use crate::{SplatGradients, SplatState, Splats, Statistics, ViewParams};
-use irradia_compute::gpu::{Array, GROUP, Gpu, Work, flags};
+use irradia_compute::gpu::{Array, Gpu, WORKGROUP_SIZE, Work, flags};
 use irradia_compute::{DeviceError, Planes};
 use irradia_scene::sh;
 use std::sync::Arc;
@@ -18,7 +18,7 @@ const SUMS: usize = 12;
 /// Threads of a workgroup of `project_vjp.wgsl`, which needs many registers.
 const VJP_GROUP: usize = 64;
 /// Components of the camera's gradient, for each visible splat.
-const CAMERA: usize = 15;
+const CAMERA_COMPONENTS: usize = 15;
 
 /// Bits of `Update.flags` in `update.wgsl`.
 mod update_flag {
@@ -88,7 +88,7 @@ impl GpuTraining {
 
     /// Maximum number of splats of `degree` for which the device's largest array suffices: for a state, and for frames with twice as many
     /// entries per splat as the last one, since views differ.
-    pub fn most_splats(&self, degree: u32) -> usize {
+    pub fn max_splats(&self, degree: u32) -> usize {
         let words = (self.renderer.gpu.info().largest_array / 4) as usize;
         let by_state = words / (3 * sh::coefficients(degree)).max(2 * GEOMETRY);
         let [count, ..] = self.renderer.shape;
@@ -138,12 +138,12 @@ impl GpuTraining {
             read_geometry(gpu, &self.moments_geometry, i * GEOMETRY, moment);
             self.moments_harmonics[i].read(gpu, 0, moment.sh.as_mut_slice());
         }
-        self.download_decisive(&mut state);
+        self.download_density_columns(&mut state);
         state
     }
 
     /// Reads the columns on which density control depends: geometry, statistics and filter.
-    pub(super) fn download_decisive(&self, state: &mut SplatState) {
+    pub(super) fn download_density_columns(&self, state: &mut SplatState) {
         let gpu = &self.renderer.gpu;
         let count = self.renderer.shape[0];
         read_geometry(gpu, &self.renderer.geometry, 0, &mut state.splats);
@@ -217,7 +217,7 @@ impl GpuTraining {
         let more = flags(&bits);
         let [count, ..] = renderer.shape;
         if of.camera {
-            self.v_camera.reserve(&gpu, CAMERA * count);
+            self.v_camera.reserve(&gpu, CAMERA_COMPONENTS * count);
         }
         renderer.add_flags(&last, more);
         self.sums.reserve(&gpu, SUMS * last.room);
@@ -280,8 +280,8 @@ impl GpuTraining {
     /// Sums the camera's gradients: over 256 splats each on the device, then these sums in order, in double precision.
     fn sum_camera(&mut self, last: &Last) -> CameraGradient {
         let gpu = &self.renderer.gpu;
-        let groups = last.found[0].div_ceil(GROUP as usize);
-        self.v_camera_sums.reserve(gpu, CAMERA * groups);
+        let groups = last.found[0].div_ceil(WORKGROUP_SIZE as usize);
+        self.v_camera_sums.reserve(gpu, CAMERA_COMPONENTS * groups);
         let mut work = Work::new(gpu);
         work.run(
             &self.renderer.kernels.sum_camera,
@@ -289,8 +289,11 @@ impl GpuTraining {
             groups,
         );
         work.submit();
-        let mut sums = [0.0f64; CAMERA];
-        for of_group in self.v_camera_sums.to_vec::<[f32; CAMERA]>(gpu, CAMERA * groups) {
+        let mut sums = [0.0f64; CAMERA_COMPONENTS];
+        for of_group in self
+            .v_camera_sums
+            .to_vec::<[f32; CAMERA_COMPONENTS]>(gpu, CAMERA_COMPONENTS * groups)
+        {
             for (sum, value) in sums.iter_mut().zip(of_group) {
                 *sum += f64::from(value);
             }
@@ -354,7 +357,7 @@ impl GpuTraining {
         let renderer = &self.renderer;
         let gpu = &renderer.gpu;
         self.update.write(gpu, 0, &words);
-        let groups = renderer.shape[0].div_ceil(GROUP as usize);
+        let groups = renderer.shape[0].div_ceil(WORKGROUP_SIZE as usize);
         let mut work = Work::new(gpu);
         work.run(
             &renderer.kernels.update_harmonics,
@@ -396,7 +399,7 @@ impl GpuTraining {
         let is_regularized = !regularizers.is_zero();
         let all = is_regularized && update.regularized == Regularized::All;
         let limit = match update.trained_fraction < 1.0 {
-            true => self.frozen_below(update.trained_fraction),
+            true => self.freeze_threshold(update.trained_fraction),
             false => None,
         };
         let noise = update.noise;
@@ -452,7 +455,7 @@ impl GpuTraining {
     }
 
     /// The size below which splats are frozen: all but the largest `fraction` of the visible ones, as in `regularize::freeze_small`.
-    fn frozen_below(&self, fraction: f32) -> Option<f32> {
+    fn freeze_threshold(&self, fraction: f32) -> Option<f32> {
         let gpu = &self.renderer.gpu;
         let [count, stride, _] = self.renderer.shape;
         let mut scales = vec![0.0f32; 3 * stride];

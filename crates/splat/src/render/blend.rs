@@ -141,7 +141,7 @@ impl BlendTile<'_> {
         // Bit b: some pixel of block b has not terminated.
         let mut live = u64::MAX;
         for (i, entry) in self.entries.iter().enumerate() {
-            if let Some(later) = self.entries.get(i + AHEAD) {
+            if let Some(later) = self.entries.get(i + PREFETCH_DISTANCE) {
                 simd.prefetch(&self.footprints[later.splat as usize]);
             }
             let blocks = entry.blocks & live;
@@ -183,7 +183,7 @@ impl BlendTile<'_> {
                         }
                     }
                     if ended {
-                        live &= !ended_block(transmittances, band * BAND_BLOCKS + block);
+                        live &= !terminated_block(transmittances, band * BAND_BLOCKS + block);
                     }
                 }
             }
@@ -192,7 +192,7 @@ impl BlendTile<'_> {
 }
 
 /// How many entries ahead footprints are prefetched: in depth order they are far apart in memory.
-const AHEAD: usize = 8;
+const PREFETCH_DISTANCE: usize = 8;
 
 /// The bits of `blocks` in `band`, from bit 0.
 #[inline(always)]
@@ -202,7 +202,7 @@ fn band_blocks(blocks: u64, band: usize) -> u32 {
 
 /// The bit of `block` if all its pixels have terminated, else 0.
 #[inline(always)]
-fn ended_block(transmittances: &[f32], block: usize) -> u64 {
+fn terminated_block(transmittances: &[f32], block: usize) -> u64 {
     let all = transmittances[block * BLOCK..][..BLOCK].iter().all(|t| *t < 0.0);
     u64::from(all) << block
 }
@@ -320,7 +320,7 @@ impl BlendTileVjp<'_> {
         let zero = simd.splat(0.0);
         let mut live = u64::MAX;
         for (i, (entry, out)) in self.entries.iter().zip(self.sums).enumerate() {
-            if let Some(later) = self.entries.get(i + AHEAD) {
+            if let Some(later) = self.entries.get(i + PREFETCH_DISTANCE) {
                 simd.prefetch(&self.footprints[later.splat as usize]);
             }
             let blocks = entry.blocks & live;
@@ -396,7 +396,7 @@ impl BlendTileVjp<'_> {
                         }
                     }
                     if ended {
-                        live &= !ended_block(&transmittances, band * BAND_BLOCKS + block);
+                        live &= !terminated_block(&transmittances, band * BAND_BLOCKS + block);
                     }
                 }
                 for part in 0..BLOCK / S::LANES {

@@ -26,7 +26,7 @@ where
 }
 
 /// How many splats ahead geometry is prefetched.
-const AHEAD: usize = 64;
+const PREFETCH_DISTANCE: usize = 64;
 
 /// Prefetches what [`load_geometry`] will read.
 #[inline(always)]
@@ -108,11 +108,11 @@ impl ProjectPart<'_, '_> {
         let mut harmonics = Harmonics::new(degree);
         // The fields of the footprints, one row each.
         let mut columns = [[0.0f32; CHUNK]; 9];
-        let mut shown = [0u32; CHUNK / 4];
+        let mut visible_bits = [0u32; CHUNK / 4];
         job.depth_keys.fill(u32::MAX);
         for at in (0..job.footprints.len()).step_by(S::LANES) {
             let first = base + at;
-            prefetch_geometry(simd, self.splats, first + AHEAD);
+            prefetch_geometry(simd, self.splats, first + PREFETCH_DISTANCE);
             let geometry = load_geometry(simd, self.splats, first);
             let filter = load_filter(simd, self.filter, first);
             let (footprint, visible) = project(&view, &geometry, filter, self.options.antialias);
@@ -121,7 +121,7 @@ impl ProjectPart<'_, '_> {
             if bits == 0 {
                 continue;
             }
-            shown[at / S::LANES] = bits;
+            visible_bits[at / S::LANES] = bits;
             harmonics.evaluate_basis(at, geometry.mean, view.center);
             let Footprint {
                 xy,
@@ -155,7 +155,7 @@ impl ProjectPart<'_, '_> {
                 log2_opacity,
             };
             let spans = Spans::new(&outline, finite, tiles_x, tiles_y);
-            let mut bits = shown[at / S::LANES] & finite.bits();
+            let mut bits = visible_bits[at / S::LANES] & finite.bits();
             count += bits.count_ones();
             while bits != 0 {
                 let lane = bits.trailing_zeros() as usize;
@@ -382,8 +382,8 @@ impl ProjectChunkVjp<'_, '_> {
             }
             let zero = simd.splat(0.0);
             let visible = simd.load(&visible);
-            let shown = zero.lt(visible);
-            if shown.none() {
+            let is_visible = zero.lt(visible);
+            if is_visible.none() {
                 visible.store(&mut chunk.active[at..]);
                 continue;
             }
@@ -413,7 +413,7 @@ impl ProjectChunkVjp<'_, '_> {
             }
             magnitude.store(&mut magnitudes[at..]);
             if CAMERA {
-                let counts = shown.and(magnitude.lt(simd.splat(f64::from(f32::MAX))));
+                let counts = is_visible.and(magnitude.lt(simd.splat(f64::from(f32::MAX))));
                 for i in 0..3 {
                     v_translation[i] += v_camera.translation[i].masked(counts);
                     for j in 0..3 {
@@ -444,7 +444,7 @@ impl ProjectChunkVjp<'_, '_> {
         let mut non_finite = 0;
         for at in harmonics.starts() {
             let visible = simd.load(&chunk.active[at..]);
-            let shown = simd.splat(0.0).lt(visible);
+            let is_visible = simd.splat(0.0).lt(visible);
             let mut magnitude = simd.load(&magnitudes[at..]);
             if self.degree > 0 {
                 let mean = load_geometry(simd, self.splats, base + at).mean;
@@ -452,7 +452,7 @@ impl ProjectChunkVjp<'_, '_> {
                 if CAMERA {
                     for c in 0..3 {
                         let finite = v_mean[c].abs().lt(simd.splat(f64::from(f32::MAX)));
-                        v_center[c] -= v_mean[c].masked(shown.and(finite));
+                        v_center[c] -= v_mean[c].masked(is_visible.and(finite));
                     }
                 }
                 for (v, to) in v_mean.iter().zip(&mut chunk.means) {
@@ -461,9 +461,9 @@ impl ProjectChunkVjp<'_, '_> {
                 }
             }
             let finite = magnitude.lt(simd.splat(f64::from(f32::MAX)));
-            non_finite += shown.and_not(finite).bits().count_ones() as usize;
-            count += shown.and(finite).bits().count_ones();
-            visible.masked(shown.and(finite)).store(&mut chunk.active[at..]);
+            non_finite += is_visible.and_not(finite).bits().count_ones() as usize;
+            count += is_visible.and(finite).bits().count_ones();
+            visible.masked(is_visible.and(finite)).store(&mut chunk.active[at..]);
         }
         chunk.counts[0] = count;
         let outcome = &mut chunk.outcomes[0];

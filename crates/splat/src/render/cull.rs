@@ -45,7 +45,7 @@ impl ChunkBounds {
     }
 
     /// For each chunk, whether `view` may see some of its splats.
-    pub(super) fn seen(&self, view: &ViewParams, seen: &mut Vec<bool>) {
+    pub(super) fn visible_chunks(&self, view: &ViewParams, seen: &mut Vec<bool>) {
         let planes = view_planes(view);
         // The sides of a lens's image are not planes: only chunks behind the camera are left out, unless the lens shows them.
         let planes = match &view.lens {
@@ -113,12 +113,12 @@ struct Plane {
 }
 
 /// A footprint's half size is at most this many standard deviations on the image: sqrt(2 ln 255) = 3.33, and 2 % for rounding.
-const REACH: f64 = 3.4;
+const EXTENT_DEVIATIONS: f64 = 3.4;
 /// Pixels added to that for the dilation, sqrt(2 ln 255 times 0.3) = 1.82, and for the half pixel to the outermost centre; the
 /// rest is for rounding.
-const MARGIN: f64 = 2.0;
+const PIXEL_MARGIN: f64 = 2.0;
 /// Relative rounding of a projected coordinate in single precision, several times over.
-const ROUNDING: f64 = 1e-5;
+const RELATIVE_ROUNDING: f64 = 1e-5;
 
 impl Plane {
     /// Whether no splat within `bound` can be seen; false if a bound is NaN.
@@ -130,7 +130,7 @@ impl Plane {
             size += ends[0].abs().max(ends[1].abs());
         }
         let reach = self.per_deviation * f64::from(bound.deviation);
-        highest + reach + self.offset + ROUNDING * size < 0.0
+        highest + reach + self.offset + RELATIVE_ROUNDING * size < 0.0
     }
 }
 
@@ -147,7 +147,7 @@ fn view_planes(view: &ViewParams) -> [Plane; 5] {
         let jacobian = view.focal[i].abs() * (1.0 + tangent * tangent).sqrt();
         Plane {
             normal: [0, 1, 2].map(|c| focal * r[i][c] + depth * r[2][c]),
-            per_deviation: REACH * jacobian,
+            per_deviation: EXTENT_DEVIATIONS * jacobian,
             offset: focal * t[i] + depth * t[2],
         }
     };
@@ -158,10 +158,10 @@ fn view_planes(view: &ViewParams) -> [Plane; 5] {
             per_deviation: 0.0,
             offset: t[2] - view.near,
         },
-        side(0, 1.0, x + MARGIN),
-        side(0, -1.0, size[0] - x + MARGIN),
-        side(1, 1.0, y + MARGIN),
-        side(1, -1.0, size[1] - y + MARGIN),
+        side(0, 1.0, x + PIXEL_MARGIN),
+        side(0, -1.0, size[0] - x + PIXEL_MARGIN),
+        side(1, 1.0, y + PIXEL_MARGIN),
+        side(1, -1.0, size[1] - y + PIXEL_MARGIN),
     ]
 }
 
@@ -209,7 +209,7 @@ mod tests {
             let mut bounds = ChunkBounds::default();
             bounds.update(renderer.level, &splats, &filter, |_| true);
             let mut seen = Vec::new();
-            bounds.seen(&view, &mut seen);
+            bounds.visible_chunks(&view, &mut seen);
             renderer.render(&splats, &view, &RenderOptions::default());
             let visible: Vec<bool> = (0..n).map(|i| renderer.screen_extent(i).is_some()).collect();
             for (chunk, seen) in visible.chunks(CHUNK).zip(&seen) {

@@ -11,7 +11,7 @@ use crate::{COLUMN_NAMES, Splats};
 use glam::{DVec3, Quat, Vec3};
 use irradia_compute::simd::{Double, Level};
 use irradia_scene::{Camera, FirstSide, GaussianCloud, Intrinsics, Lens, Pose, Rng, RollingShutter, sh::coefficients};
-use irradia_testkit::differences::Differences;
+use irradia_testkit::finite_differences::FiniteDifferences;
 use irradia_testkit::relative_difference;
 
 /// A splat as plain numbers: mean, quaternion, ln scales, opacity logit, then SH `[k, channel]`.
@@ -397,10 +397,10 @@ fn every_gradient_matches_finite_differences() {
         let each = splats[0].len();
         let value = |flat: &[f64]| scene.loss(&flat.chunks(each).map(<[f64]>::to_vec).collect::<Vec<_>>());
         // Errors: truncation h^2 f''' and rounding 1e-16 f / h; both are far below the tolerance at this step.
-        let differences = Differences {
+        let differences = FiniteDifferences {
             step: 1e-6,
             relative: 1e-6,
-            of_largest: 1e-8,
+            relative_to_max: 1e-8,
             absolute: 0.0,
         };
         let what = format!("seed {seed}, {each} values per splat");

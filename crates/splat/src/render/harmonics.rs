@@ -10,7 +10,7 @@ use irradia_compute::simd::{Lanes, Simd};
 use irradia_scene::sh::coefficients;
 
 /// Splats per task of projection: a multiple of every vector length, and small enough for the buffers to stay in cache.
-pub const CHUNK: usize = irradia_compute::adam::RUN;
+pub const CHUNK: usize = irradia_compute::adam::RUN_LEN;
 
 /// The plane after `plane` from splat `first` on, to be prefetched while `plane` is read: a chunk reads more planes in turn than the
 /// processor's prefetchers follow.

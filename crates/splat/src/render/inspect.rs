@@ -36,10 +36,10 @@ pub struct Hit {
 }
 
 /// Squared distance of an ellipse's border, and of its rim's inner edge.
-const BORDER: f32 = 1.5 * 1.5;
-const RIM: f32 = 1.3 * 1.3;
+const BORDER_SQUARED: f32 = 1.5 * 1.5;
+const RIM_SQUARED: f32 = 1.3 * 1.3;
 /// Squared radius of a point, pixels.
-const POINT: f32 = 1.5 * 1.5;
+const POINT_SQUARED: f32 = 1.5 * 1.5;
 
 /// log2 of alpha at the pixel centre `(x, y)`, before the cap.
 fn log2_alpha(s: &Footprint2d, x: f32, y: f32) -> f32 {
@@ -71,11 +71,11 @@ impl Renderer {
             let (alpha, shade) = match shape {
                 Shape::Points => {
                     let (dx, dy) = (x - s.xy[0], y - s.xy[1]);
-                    (f32::from(u8::from(dx * dx + dy * dy <= POINT)), 1.0)
+                    (f32::from(u8::from(dx * dx + dy * dy <= POINT_SQUARED)), 1.0)
                 }
                 Shape::Ellipses | Shape::Rings => {
                     let m = 2.0 * LN_2 * (s.log2_opacity - log2_alpha(s, x, y));
-                    match (m <= BORDER, m >= RIM, shape) {
+                    match (m <= BORDER_SQUARED, m >= RIM_SQUARED, shape) {
                         (false, ..) | (_, false, Shape::Rings) => return true,
                         (_, true, Shape::Rings) => (0.6, 1.0),
                         (_, rim, _) => (1.0, if rim { 0.7 } else { 1.0 }),

@@ -13,12 +13,12 @@ use std::ops::{Add, Mul};
 
 /// Perspective lenses are evaluated up to this multiple of the largest radius of the image's border on the undistorted plane; beyond it
 /// they are continued by their tangent, similar to gsplat's limit on the Jacobian of pinholes. Beyond a fold they show nothing.
-const BEYOND_CORNERS: f64 = 1.3;
+const MAX_RADIUS_FACTOR: f64 = 1.3;
 /// Points that the middle row's camera does not see may be seen by other rows: wide lenses that move are evaluated up to this multiple
 /// of their angle.
-const BEYOND_MOVED: f64 = 1.1;
+const MAX_ANGLE_FACTOR: f64 = 1.1;
 /// Positions along each side of an image at which its largest radius or angle is searched.
-const SAMPLES: u32 = 16;
+const SIDE_SAMPLES: u32 = 16;
 
 /// A lens other than a pinhole at rest, and how far from its axis it is evaluated.
 #[derive(Clone, Debug, PartialEq)]
@@ -41,19 +41,19 @@ impl LensParams {
         }
         let (k, lens) = (&camera.intrinsics, camera.intrinsics.lens);
         let size = DVec2::new(f64::from(k.width), f64::from(k.height));
-        let border = (0..=SAMPLES).flat_map(|i| {
-            let t = f64::from(i) / f64::from(SAMPLES);
+        let border = (0..=SIDE_SAMPLES).flat_map(|i| {
+            let t = f64::from(i) / f64::from(SIDE_SAMPLES);
             [[t, 0.0], [t, 1.0], [0.0, t], [1.0, t]]
         });
         let directions = border.map(|place| lens.direction(k.plane_of(DVec2::from(place) * size)));
         let (limit, ends) = if lens.is_wide() {
             let angles = directions.map(|d| d.map_or(f64::INFINITY, |d| d.truncate().length().atan2(d.z)));
-            let moved = camera.shutter.map_or(1.0, |_| BEYOND_MOVED);
+            let moved = camera.shutter.map_or(1.0, |_| MAX_ANGLE_FACTOR);
             let largest = moved * angles.fold(0.0, f64::max);
             (largest.min(lens.reach_in_angle()).cos(), true)
         } else {
             let known = directions.flatten().map(|d| d.truncate().length() / d.z);
-            let limit = BEYOND_CORNERS * known.fold(0.0, f64::max);
+            let limit = MAX_RADIUS_FACTOR * known.fold(0.0, f64::max);
             let reach = lens.reach_on_plane(limit);
             (limit.min(reach), reach < limit)
         };
@@ -74,19 +74,19 @@ impl LensParams {
     /// Pixel coordinates and depth of `x`, a position in the camera; `None` if the lens does not show it.
     pub(crate) fn project(&self, x: [f64; 3], focal: [f64; 2], principal: [f64; 2]) -> Option<([f64; 2], f64)> {
         let at = self.lanes(Double).at(x, focal, principal);
-        at.shown.then_some((at.xy, at.depth))
+        at.visible.then_some((at.xy, at.depth))
     }
 
     #[inline(always)]
     pub(super) fn lanes<S: Simd>(&self, simd: S) -> LensLanes<S::F> {
-        let bend = match self.lens {
-            Lens::Pinhole => Bend::None,
-            Lens::Equirectangular => Bend::Equirectangular,
-            Lens::Opencv { k, p } => Bend::Opencv {
+        let model = match self.lens {
+            Lens::Pinhole => LensModel::None,
+            Lens::Equirectangular => LensModel::Equirectangular,
+            Lens::Opencv { k, p } => LensModel::Opencv {
                 k: unroll!(i in 6 => simd.splat(k[i])),
                 p: unroll!(i in 2 => simd.splat(p[i])),
             },
-            Lens::Fisheye { k, p, s } => Bend::Fisheye {
+            Lens::Fisheye { k, p, s } => LensModel::Fisheye {
                 k: unroll!(i in 4 => simd.splat(k[i])),
                 p: unroll!(i in 2 => simd.splat(p[i])),
                 s: unroll!(i in 2 => simd.splat(s[i])),
@@ -94,7 +94,7 @@ impl LensParams {
             Lens::Fov { omega } => {
                 // At 0 the model is a pinhole; the bound keeps `scale / omega` at 1 there.
                 let omega = omega.max(1e-6);
-                Bend::Fov {
+                LensModel::Fov {
                     scale: simd.splat(2.0 * (0.5 * omega).tan()),
                     omega: simd.splat(omega),
                 }
@@ -114,7 +114,7 @@ impl LensParams {
             }
         });
         LensLanes {
-            bend,
+            model,
             shutter,
             limit: simd.splat(self.limit),
             ends: self.ends,
@@ -124,7 +124,7 @@ impl LensParams {
 
 /// [`LensParams`] broadcast to all lanes.
 pub(super) struct LensLanes<F> {
-    bend: Bend<F>,
+    model: LensModel<F>,
     shutter: Option<ShutterLanes<F>>,
     limit: F,
     ends: bool,
@@ -143,7 +143,7 @@ struct ShutterLanes<F> {
 }
 
 /// The models of [`Lens`], with their coefficients.
-enum Bend<F> {
+enum LensModel<F> {
     None,
     Equirectangular,
     Opencv { k: [F; 6], p: [F; 2] },
@@ -160,7 +160,7 @@ pub(super) struct LensAt<F: Lanes> {
     /// The Jacobian of the pixel coordinates.
     pub jacobian: [[F; 3]; 2],
     /// Whether the lens shows it.
-    pub shown: F::Mask,
+    pub visible: F::Mask,
     /// Second derivatives of the pixel coordinates: the derivatives of `jacobian`.
     second: [[F; 6]; 2],
     depth_gradient: [F; 3],
@@ -187,8 +187,8 @@ impl<F: Lanes> LensLanes<F> {
         let zero = x[0].splat(0.0);
         let one = x[0].splat(1.0);
         let radius = (x[0] * x[0] + x[1] * x[1]).sqrt();
-        let is_wide = matches!(self.bend, Bend::Fisheye { .. } | Bend::Equirectangular);
-        let (from, limited, depth, depth_gradient, shown) = if is_wide {
+        let is_wide = matches!(self.model, LensModel::Fisheye { .. } | LensModel::Equirectangular);
+        let (from, limited, depth, depth_gradient, visible) = if is_wide {
             let distance = radius.mul_add(radius, x[2] * x[2]).sqrt();
             let direction = unroll!(i in 3 => x[i] / distance);
             (x, None, distance, direction, self.limit.lt(direction[2]))
@@ -206,9 +206,9 @@ impl<F: Lanes> LensLanes<F> {
                 shrunk,
             };
             let from = [x[0] - rest[0], x[1] - rest[1], x[2]];
-            let shown = zero.lt(x[2]);
-            let shown = if self.ends { shown.and_not(beyond) } else { shown };
-            (from, Some(limited), x[2], [zero, zero, one], shown)
+            let visible = zero.lt(x[2]);
+            let visible = if self.ends { visible.and_not(beyond) } else { visible };
+            (from, Some(limited), x[2], [zero, zero, one], visible)
         };
         let position = unroll!(i in 3 => Jet::variable(from[i], i));
         let plane = match &self.shutter {
@@ -226,7 +226,7 @@ impl<F: Lanes> LensLanes<F> {
             xy,
             depth,
             jacobian,
-            shown,
+            visible,
             second: unroll!(r in 2 => unroll!(i in 6 => focal[r] * plane[r].second[i])),
             depth_gradient,
             limited,
@@ -264,18 +264,18 @@ impl<F: Lanes> LensLanes<F> {
     #[inline(always)]
     fn plane(&self, [x, y, z]: [Jet<F>; 3]) -> [Jet<F>; 2] {
         let two = z.value.splat(2.0);
-        match &self.bend {
-            Bend::None => {
+        match &self.model {
+            LensModel::None => {
                 let inverse = z.recip();
                 [x * inverse, y * inverse]
             }
-            Bend::Equirectangular => {
+            LensModel::Equirectangular => {
                 let level2 = x * x + z * z;
                 let level = level2.sqrt();
                 let distance = (level2 + y * y).sqrt();
                 [angle(x, level + z), angle(y, distance + level)]
             }
-            Bend::Opencv { k, p } => {
+            LensModel::Opencv { k, p } => {
                 let inverse = z.recip();
                 let plane = [x * inverse, y * inverse];
                 let r2 = plane[0] * plane[0] + plane[1] * plane[1];
@@ -283,7 +283,7 @@ impl<F: Lanes> LensLanes<F> {
                 let below = ((r2.scale(k[5]).plus(k[4]) * r2).plus(k[3]) * r2).plus(two.splat(1.0));
                 tangential(plane, r2, above * below.recip(), *p)
             }
-            Bend::Fisheye { k, p, s } => {
+            LensModel::Fisheye { k, p, s } => {
                 // theta / rho = 2 atan(t) / (t (d + z)) with the half angle's tangent t = rho / (d + z), which is smooth on the axis.
                 let rho2 = x * x + y * y;
                 let inverse = ((rho2 + z * z).sqrt() + z).recip();
@@ -295,7 +295,7 @@ impl<F: Lanes> LensLanes<F> {
                 let bent = tangential(plane, r2, radial, *p);
                 unroll!(i in 2 => bent[i] + r2.scale(s[i]))
             }
-            Bend::Fov { scale, omega } => {
+            LensModel::Fov { scale, omega } => {
                 let inverse = z.recip();
                 let plane = [x * inverse, y * inverse];
                 let r2 = plane[0] * plane[0] + plane[1] * plane[1];

@@ -7,13 +7,13 @@ mod bin;
 mod blend;
 mod chunk;
 mod cull;
-mod develop;
 mod harmonics;
 mod inspect;
 mod lens;
 mod project;
 mod sh;
 mod touch;
+mod untile;
 mod view;
 
 #[cfg(test)]
@@ -31,10 +31,10 @@ use crate::Splats;
 use bin::{Bins, Part, TILE};
 use blend::{BLOCK, BlendTile, BlendTileVjp, CHANNELS, Footprint2d, SUMS, TILE_PIXELS, gather};
 use chunk::{ChunkJob, ChunkOutcome, GradientRun, ProjectChunkVjp, ProjectPart};
-use develop::{Content, DevelopLine, GatherTile, Tiles};
 use irradia_compute::Planes;
 use irradia_compute::simd::Level;
 use rayon::prelude::*;
+use untile::{Content, GatherTile, Tiles, UntileLine};
 
 /// How a frame is rendered.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -372,7 +372,7 @@ impl Renderer {
             self.part_of.resize(chunks, 0);
         }
         if let Some(bounds) = bounds {
-            bounds.seen(view, &mut self.seen);
+            bounds.visible_chunks(view, &mut self.seen);
             assert_eq!(self.seen.len(), chunks, "bounds of these splats");
         } else {
             self.seen.clear();
@@ -455,7 +455,7 @@ impl Renderer {
         };
         self.color.par_chunks_mut(width).enumerate().for_each(|(line, to)| {
             let (channel, y) = (line / height, line % height);
-            level.run(DevelopLine {
+            level.run(UntileLine {
                 tiles,
                 y,
                 content: Content::Color(channel, options.background[channel]),
@@ -463,7 +463,7 @@ impl Renderer {
             });
         });
         self.alpha.par_chunks_mut(width).enumerate().for_each(|(y, to)| {
-            level.run(DevelopLine {
+            level.run(UntileLine {
                 tiles,
                 y,
                 content: Content::Alpha,
@@ -471,7 +471,7 @@ impl Renderer {
             });
         });
         self.depth.par_chunks_mut(width).enumerate().for_each(|(y, to)| {
-            level.run(DevelopLine {
+            level.run(UntileLine {
                 tiles,
                 y,
                 content: Content::Depth,

@@ -210,7 +210,7 @@ pub(super) fn project<F: Lanes>(
     let half = reach.splat(0.5);
     let mut visible = view.near.lt(depth).and(reach.splat(ALPHA_MIN).le(opacity));
     if let Some(lens) = &at.lens {
-        visible = visible.and(lens.shown);
+        visible = visible.and(lens.visible);
     }
     for i in 0..2 {
         // Some pixel centre (0.5 .. size - 0.5) must lie within the box; NaN fails both.
@@ -392,8 +392,8 @@ fn pinhole_vjp<F: Lanes>(
         v_x[2] -= v_j_scale * j_scale * at.inv_z;
         let v_tangent = -j_scale * dot(v_jr[r], view.r[2]);
         let tangent = at.x[r] * at.inv_z;
-        let [least, largest] = view.limits[r];
-        let v_tangent = v_tangent.masked(least.lt(tangent).and(tangent.lt(largest)));
+        let [lowest, highest] = view.limits[r];
+        let v_tangent = v_tangent.masked(lowest.lt(tangent).and(tangent.lt(highest)));
         // The pixel position also depends on the tangent, unclamped.
         let v_free = v_tangent + v_out.xy[r] * view.f[r];
         v_x[r] += v_free * at.inv_z;

@@ -10,9 +10,9 @@ use irradia_compute::simd::{Lanes, Mask, Simd};
 
 /// Margin on every side against rounding in the bounds, pixels.
 const SLACK: f32 = 1e-2;
-const WIDTH: f32 = BLOCK_WIDTH as f32;
+const BAND_WIDTH: f32 = BLOCK_WIDTH as f32;
 /// Bands in a tile.
-const BANDS: usize = TILE / BLOCK_WIDTH;
+const TILE_BANDS: usize = TILE / BLOCK_WIDTH;
 /// Spans of splats that touch more bands are not worth computing for a whole vector.
 const MAX_BANDS: usize = 12;
 
@@ -38,18 +38,18 @@ pub(super) struct Outline<F> {
 }
 
 impl Spans {
-    /// The spans of the splats `shown` on an image of `tiles_x` by `tiles_y` tiles.
+    /// The spans of the splats `visible` on an image of `tiles_x` by `tiles_y` tiles.
     #[inline(always)]
-    pub fn new<F: Lanes<Scalar = f32>>(s: &Outline<F>, shown: F::Mask, tiles_x: usize, tiles_y: usize) -> Self {
+    pub fn new<F: Lanes<Scalar = f32>>(s: &Outline<F>, visible: F::Mask, tiles_x: usize, tiles_y: usize) -> Self {
         let constant = |value: f32| s.log2_opacity.simd().set(value);
         let (zero, half) = (constant(0.0), constant(0.5));
         let [x, y] = s.xy;
         let [ex, ey] = s.extent;
         let [a, b, c] = s.quadratic;
-        let (per_width, slack) = (constant(1.0 / WIDTH), constant(SLACK));
-        let top_band = constant((tiles_x * BANDS) as f32 - 1.0);
+        let (per_width, slack) = (constant(1.0 / BAND_WIDTH), constant(SLACK));
+        let top_band = constant((tiles_x * TILE_BANDS) as f32 - 1.0);
         // Pixel centres of band k lie at 8 k + 0.5 ..= 8 k + 7.5.
-        let first = ceil((x - ex - slack - constant(WIDTH - 0.5)) * per_width).max(zero);
+        let first = ceil((x - ex - slack - constant(BAND_WIDTH - 0.5)) * per_width).max(zero);
         let last = ((x + ex + slack - half) * per_width).floor().min(top_band);
         let mut spans = Self {
             bands: [[0.0; 16]; 2],
@@ -57,7 +57,7 @@ impl Spans {
         };
         first.store(&mut spans.bands[0]);
         last.store(&mut spans.bands[1]);
-        let narrow = shown.and((last - first).lt(constant(MAX_BANDS as f32)));
+        let narrow = visible.and((last - first).lt(constant(MAX_BANDS as f32)));
         // d^T conic d <= t with conic = -(a, b / 2, c).
         let t = s.log2_opacity - constant(LOG2_ALPHA_MIN as f32);
         let (inv_ex, middle_slope) = (ex.max(constant(1e-6)).recip(), constant(-0.5) * b * c.recip());
@@ -71,9 +71,9 @@ impl Spans {
             if narrow.and(band.le(last)).none() {
                 break;
             }
-            let edge = band * constant(WIDTH) - x;
+            let edge = band * constant(BAND_WIDTH) - x;
             let left = (edge + half).max(-ex);
-            let right = (edge + constant(WIDTH - 0.5)).min(ex);
+            let right = (edge + constant(BAND_WIDTH - 0.5)).min(ex);
             // `right < left` only within the margin: then both clamps give an end of the ellipse.
             let dx_high = x_at_top.min(right).max(left);
             let dx_low = (-x_at_top).min(right).max(left);
@@ -130,8 +130,8 @@ fn wide_spans(s: &Footprint2d, tiles_y: usize) -> impl Fn(usize) -> Span {
     let x_at_top = -0.5 * b / a * ey;
     let last_image_row = (tiles_y * TILE) as f32 - 1.0;
     move |band: usize| {
-        let edge = band as f32 * WIDTH - x;
-        let (left, right) = ((edge + 0.5).max(-ex), (edge + WIDTH - 0.5).min(ex));
+        let edge = band as f32 * BAND_WIDTH - x;
+        let (left, right) = ((edge + 0.5).max(-ex), (edge + BAND_WIDTH - 0.5).min(ex));
         let dx_high = x_at_top.min(right).max(left);
         let dx_low = (-x_at_top).min(right).max(left);
         let (u_high, u_low) = (dx_high * inv_ex, dx_low * inv_ex);
@@ -158,12 +158,12 @@ fn tiles_of(
     tiles_x: usize,
     mut hit: impl FnMut(u32, u64),
 ) {
-    for column in first_band / BANDS..=last_band / BANDS {
-        let mut spans = [NO_SPAN; BANDS];
+    for column in first_band / TILE_BANDS..=last_band / TILE_BANDS {
+        let mut spans = [NO_SPAN; TILE_BANDS];
         let (mut first, mut last) = NO_SPAN;
-        for band in first_band.max(BANDS * column)..=last_band.min(BANDS * column + BANDS - 1) {
+        for band in first_band.max(TILE_BANDS * column)..=last_band.min(TILE_BANDS * column + TILE_BANDS - 1) {
             let s = span(band);
-            spans[band % BANDS] = s;
+            spans[band % TILE_BANDS] = s;
             if s.0 <= s.1 {
                 first = first.min(s.0);
                 last = last.max(s.1);
@@ -214,9 +214,9 @@ mod tests {
                 quadratic: s.quadratic.map(|v| simd.set(v)),
                 log2_opacity: simd.set(s.log2_opacity),
             };
-            let shown = simd.splat(0.0).le(simd.splat(0.0));
+            let visible = simd.splat(0.0).le(simd.splat(0.0));
             let mut blocks = HashMap::new();
-            Spans::new(&outline, shown, tiles_x, tiles_y).tiles(0, s, tiles_x, tiles_y, |tile, b| {
+            Spans::new(&outline, visible, tiles_x, tiles_y).tiles(0, s, tiles_x, tiles_y, |tile, b| {
                 assert!(blocks.insert(tile, b).is_none(), "a tile is listed once");
             });
             blocks

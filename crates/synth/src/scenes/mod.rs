@@ -47,7 +47,7 @@ impl SceneName {
 
     /// The scene and its rig.
     pub fn build(self, seed: u64) -> (SynthScene, Rig) {
-        let rng = &mut Rng::new(seed, LAYOUT);
+        let rng = &mut Rng::new(seed, STREAM_LAYOUT);
         match self {
             SceneName::Demo => (demo_scene(), cameras::DEMO),
             SceneName::Room => room::build(rng),
@@ -80,7 +80,7 @@ impl FromStr for SceneName {
 }
 
 /// Random stream of the layout, separate from those of cameras and points.
-const LAYOUT: u64 = 500;
+const STREAM_LAYOUT: u64 = 500;
 
 fn matte(shape: Shape, texture: Texture) -> Object {
     Object {

@@ -11,7 +11,7 @@ use irradia_scene::Rng;
 use std::f32::consts::TAU;
 
 /// Radius of the sky, metres: a hundred times the cameras' distance, so that it has no parallax.
-const SKY: f32 = 400.0;
+const SKY_RADIUS: f32 = 400.0;
 
 pub fn build(rng: &mut Rng) -> (SynthScene, Rig) {
     let mut clusters = vec![Cluster::new(boulders(rng)), Cluster::new(sign(rng))];
@@ -27,7 +27,7 @@ pub fn build(rng: &mut Rng) -> (SynthScene, Rig) {
     let scene = SynthScene {
         surroundings: vec![
             matte(Shape::Ground { height: 0.0 }, Texture::Park),
-            matte(Shape::Backdrop { radius: SKY }, Texture::Sky),
+            matte(Shape::Backdrop { radius: SKY_RADIUS }, Texture::Sky),
         ],
         clusters,
         light: sky::DAYLIGHT,

@@ -29,7 +29,7 @@ pub fn build(rng: &mut Rng) -> (SynthScene, Rig) {
             Cluster::new(bed(rng, half)),
             Cluster::new(bookcase(rng, half)),
             Cluster::new(table(rng)),
-            Cluster::new(hung(rng, half)),
+            Cluster::new(wall_hangings(rng, half)),
             Cluster::new(lamp(rng, half)),
         ],
         light: LIGHT,
@@ -158,7 +158,7 @@ fn table(rng: &mut Rng) -> Vec<Object> {
 }
 
 /// A picture at +Y and a window at -Y.
-fn hung(rng: &mut Rng, half: Vec2) -> Vec<Object> {
+fn wall_hangings(rng: &mut Rng, half: Vec2) -> Vec<Object> {
     let frame = Texture::Plain(any_tint(rng) * 0.5);
     let white = Texture::Plain(Vec3::splat(0.75));
     let (picture, window) = (rng.range(-1.2, 1.2), rng.range(-0.6, 0.6));

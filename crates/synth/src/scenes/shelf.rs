@@ -18,7 +18,7 @@ const LIGHT: Light = Light {
 };
 
 /// Half the width, half the depth and the height, metres.
-const SIZE: Vec3 = Vec3::new(1.25, 0.19, 1.9);
+const SHELF_SIZE: Vec3 = Vec3::new(1.25, 0.19, 1.9);
 
 pub fn build(rng: &mut Rng) -> (SynthScene, Rig) {
     let wall = tint(rng.uniform(), rng.range(0.05, 0.2), rng.range(0.5, 0.7));
@@ -36,8 +36,12 @@ pub fn build(rng: &mut Rng) -> (SynthScene, Rig) {
     clusters.push(Cluster::new(boards(rng, columns, rows)));
     for row in 0..rows {
         for column in 0..columns {
-            let cell = Vec2::new(2.0 * SIZE.x / columns as f32, SIZE.z / rows as f32);
-            let corner = Vec3::new(-SIZE.x + cell.x * column as f32 + 0.03, 0.0, cell.y * row as f32 + 0.03);
+            let cell = Vec2::new(2.0 * SHELF_SIZE.x / columns as f32, SHELF_SIZE.z / rows as f32);
+            let corner = Vec3::new(
+                -SHELF_SIZE.x + cell.x * column as f32 + 0.03,
+                0.0,
+                cell.y * row as f32 + 0.03,
+            );
             clusters.push(Cluster::new(objects(rng, corner, cell - 0.05)));
         }
     }
@@ -53,7 +57,7 @@ pub fn build(rng: &mut Rng) -> (SynthScene, Rig) {
         clusters,
         light: LIGHT,
     };
-    let path = Path::Before {
+    let path = Path::InFront {
         target: Vec3::new(0.0, 0.0, 1.0),
         distance: 2.3,
         half: Vec2::new(0.55, 0.35),
@@ -63,20 +67,20 @@ pub fn build(rng: &mut Rng) -> (SynthScene, Rig) {
 
 fn boards(rng: &mut Rng, columns: u32, rows: u32) -> Vec<Object> {
     let wood = Texture::Wood(Vec3::new(0.5, 0.33, 0.19) * rng.range(0.4, 1.2));
-    let level = |row: u32| SIZE.z * row as f32 / rows as f32 + 0.015;
-    let upright = |column: u32| -SIZE.x + 2.0 * SIZE.x * column as f32 / columns as f32;
+    let level = |row: u32| SHELF_SIZE.z * row as f32 / rows as f32 + 0.015;
+    let upright = |column: u32| -SHELF_SIZE.x + 2.0 * SHELF_SIZE.x * column as f32 / columns as f32;
     let mut parts = vec![matte(
         block(
-            Vec3::new(0.0, 0.2, 0.5 * SIZE.z),
-            Vec3::new(SIZE.x, 0.008, 0.5 * SIZE.z),
+            Vec3::new(0.0, 0.2, 0.5 * SHELF_SIZE.z),
+            Vec3::new(SHELF_SIZE.x, 0.008, 0.5 * SHELF_SIZE.z),
             0.0,
         ),
         wood,
     )];
-    let half = Vec3::new(SIZE.x + 0.015, SIZE.y, 0.015);
+    let half = Vec3::new(SHELF_SIZE.x + 0.015, SHELF_SIZE.y, 0.015);
     parts.extend((0..=rows).map(|row| matte(block(Vec3::Z * level(row), half, 0.0), wood)));
-    let half = Vec3::new(0.015, SIZE.y, 0.5 * SIZE.z);
-    let place = |column| Vec3::new(upright(column), 0.0, 0.5 * SIZE.z);
+    let half = Vec3::new(0.015, SHELF_SIZE.y, 0.5 * SHELF_SIZE.z);
+    let place = |column| Vec3::new(upright(column), 0.0, 0.5 * SHELF_SIZE.z);
     parts.extend((0..=columns).map(|column| matte(block(place(column), half, 0.0), wood)));
     parts
 }

@@ -1,6 +1,6 @@
 //! The values carried by the clock, by parameter name, so that a new parameter leaves old checkpoints readable.
 
-use super::reals;
+use super::f64s;
 use crate::recipe::{Param, Values};
 use crate::trainer::TrainError;
 use safetensors::tensor::{Dtype, SafeTensors};
@@ -78,7 +78,7 @@ pub(super) fn read(file: &SafeTensors, unnamed: &[f64]) -> Result<Values, TrainE
                  wrote it"
             ))
         })?;
-        let ([value], Dtype::F64) = (&reals(view.data())[..], view.dtype()) else {
+        let ([value], Dtype::F64) = (&f64s(view.data())[..], view.dtype()) else {
             return Err(TrainError::Checkpoint(format!(
                 "the checkpoint is damaged: {PREFIX}{name} is not one number"
             )));

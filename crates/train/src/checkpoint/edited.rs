@@ -1,6 +1,6 @@
 //! Checkpoints of edited scenes: the optimiser's state follows the splats.
 
-use super::{COLUMN_NAMES, Content, OWNERS, Tensor, planes_of, recipe_of, write_tensors};
+use super::{COLUMN_NAMES, COLUMN_OWNERS, Content, Tensor, planes_of, recipe_of, write_tensors};
 use crate::trainer::TrainError;
 use irradia_compute::Planes;
 use irradia_splat::Splats;
@@ -16,7 +16,7 @@ pub fn splats_of(bytes: &[u8]) -> Result<Splats, TrainError> {
     let file = SafeTensors::deserialize(bytes).map_err(|e| damaged(e.to_string()))?;
     let mut splats = Splats::default();
     for (name, planes) in COLUMN_NAMES.iter().zip(splats.columns_mut()) {
-        *planes = planes_of(&file, &format!("{}.{name}", OWNERS[0])).map_err(damaged)?;
+        *planes = planes_of(&file, &format!("{}.{name}", COLUMN_OWNERS[0])).map_err(damaged)?;
     }
     let shapes = |splats: &Splats| splats.columns().map(|column| (column.count(), column.len()));
     match shapes(&splats) == shapes(&Splats::zeros(splats.len(), splats.sh_degree())) {
@@ -42,9 +42,9 @@ pub fn with_splats(bytes: &[u8], splats: &Splats, sources: &[Option<u32>]) -> Re
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| damaged(e.to_string()))?;
     let of_splats: Vec<String> = COLUMN_NAMES
         .iter()
-        .map(|name| format!("{}.{name}", OWNERS[0]))
+        .map(|name| format!("{}.{name}", COLUMN_OWNERS[0]))
         .collect();
-    let followers = OWNERS[1..]
+    let followers = COLUMN_OWNERS[1..]
         .iter()
         .flat_map(|owner| COLUMN_NAMES.map(|name| format!("{owner}.{name}")));
     let followers: Vec<String> = followers

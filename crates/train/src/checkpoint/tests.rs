@@ -100,7 +100,7 @@ fn photographs_that_were_left_out_and_what_was_hidden_stay_so() {
     assert_eq!(read(&to_bytes(&trainer)).unwrap().trained, [1]);
     // Files from before photographs could be left out train on all.
     let older = rewritten(&to_bytes(&trainer), FORMAT, |tensors| {
-        tensors.retain(|(name, ..)| name != TRAINED)
+        tensors.retain(|(name, ..)| name != TRAINED_TENSOR)
     });
     assert_eq!(read(&older).unwrap().trained, [0, 1]);
 
@@ -109,7 +109,7 @@ fn photographs_that_were_left_out_and_what_was_hidden_stay_so() {
     let bytes = to_bytes(&trainer);
     assert_eq!(read(&bytes).unwrap().hidden, trainer.hidden);
     let elsewhere = rewritten(&bytes, FORMAT, |tensors| {
-        let (.., pairs) = tensors.iter_mut().find(|(name, ..)| name == HIDDEN).unwrap();
+        let (.., pairs) = tensors.iter_mut().find(|(name, ..)| name == HIDDEN_TENSOR).unwrap();
         pairs[0] = 9;
     });
     assert!(read(&elsewhere).err().unwrap().contains("hidden_blocks"));

@@ -16,7 +16,7 @@ pub struct EvaluationPoint {
 
 /// Maximum number of logged losses per block: about the number of views of a small scene, so that a block's mean depends more
 /// on the model than on the views.
-const BLOCK: usize = 25;
+const MAX_BLOCK_LEN: usize = 25;
 
 /// The evaluations of a run, in order; the last is that of the final scene.
 pub(super) fn evaluations(report: &Report) -> Vec<EvaluationPoint> {
@@ -57,7 +57,7 @@ pub(super) fn levels(runs: &[Vec<EvaluationPoint>]) -> Vec<f64> {
 
 /// Position along `axis` (seconds or steps) at which a run first reached `psnr`, linearly interpolated between two evaluations; if
 /// the first evaluation is above it, that evaluation's position, an upper bound. `None` if it was never reached.
-pub fn reached(evaluations: &[EvaluationPoint], psnr: f64, axis: fn(&EvaluationPoint) -> f64) -> Option<f64> {
+pub fn position_at_psnr(evaluations: &[EvaluationPoint], psnr: f64, axis: fn(&EvaluationPoint) -> f64) -> Option<f64> {
     let at = evaluations.iter().position(|point| point.psnr >= psnr)?;
     let here = &evaluations[at];
     let Some(before) = at.checked_sub(1).map(|at| &evaluations[at]) else {
@@ -70,9 +70,9 @@ pub fn reached(evaluations: &[EvaluationPoint], psnr: f64, axis: fn(&EvaluationP
 /// The fraction of blocks of steps in which the training loss rises: the logged losses in order, in blocks of 25 (of fewer if
 /// there are under 250, but at least 5), the mean of each compared with the previous one. Single steps show different views, and their
 /// losses rise half of the time in any case. `None` with fewer than two blocks.
-pub fn rises(losses: &[f64]) -> Option<f64> {
+pub fn rise_fraction(losses: &[f64]) -> Option<f64> {
     let losses: Vec<f64> = losses.iter().copied().filter(|loss| loss.is_finite()).collect();
-    let block = (losses.len() / 10).clamp(5, BLOCK);
+    let block = (losses.len() / 10).clamp(5, MAX_BLOCK_LEN);
     let means: Vec<f64> = losses
         .chunks_exact(block)
         .map(|block| block.iter().sum::<f64>() / block.len() as f64)
@@ -81,7 +81,7 @@ pub fn rises(losses: &[f64]) -> Option<f64> {
 }
 
 /// The fraction of evaluations of the held-out views with a lower PSNR than the previous one. `None` with fewer than two.
-pub fn falls(evaluations: &[EvaluationPoint]) -> Option<f64> {
+pub fn fall_fraction(evaluations: &[EvaluationPoint]) -> Option<f64> {
     let psnr: Vec<f64> = evaluations.iter().map(|point| point.psnr).collect();
     fraction(&psnr, |before, after| after < before)
 }

@@ -8,7 +8,7 @@ mod page;
 mod published;
 mod table;
 
-pub use curves::{EvaluationPoint, falls, reached, rises};
+pub use curves::{EvaluationPoint, fall_fraction, position_at_psnr, rise_fraction};
 pub use page::{picture, to_html};
 pub use published::{Published, PublishedFigures, published};
 pub use table::{to_markdown, to_text};
@@ -87,16 +87,16 @@ pub struct Entry {
     pub parameters: Option<Spread>,
     /// Peak memory of the process, bytes.
     pub peak_memory: Option<Spread>,
-    /// Fraction of blocks of steps whose mean training loss is above that of the previous block; see [`rises`].
+    /// Fraction of blocks of steps whose mean training loss is above that of the previous block; see [`rise_fraction`].
     pub loss_rises: Option<Spread>,
     /// The same for the mean squared error of the training views, which is comparable between recipes and stages.
     pub error_rises: Option<Spread>,
-    /// Fraction of evaluations whose held-out PSNR is below the previous one; see [`falls`].
+    /// Fraction of evaluations whose held-out PSNR is below the previous one; see [`fall_fraction`].
     pub psnr_falls: Option<Spread>,
     /// When each half dB was reached.
-    pub reached: Vec<Reached>,
+    pub reached: Vec<Milestone>,
     /// When the scene's mark was reached.
-    pub to_mark: Option<Reached>,
+    pub to_mark: Option<Milestone>,
     /// Seconds to the mark divided by those of the first recipe's whole run; `None` unless every finished run reached it.
     pub mark_share: Option<f64>,
 }
@@ -148,11 +148,11 @@ pub struct Figures {
     /// Evaluations of held-out PSNR, including the final one.
     #[serde(rename = "looks")]
     pub evaluations: Vec<EvaluationPoint>,
-    /// See [`rises`].
+    /// See [`rise_fraction`].
     pub loss_rises: Option<f64>,
-    /// See [`rises`].
+    /// See [`rise_fraction`].
     pub error_rises: Option<f64>,
-    /// See [`falls`].
+    /// See [`fall_fraction`].
     pub psnr_falls: Option<f64>,
 }
 
@@ -169,7 +169,7 @@ pub struct Spread {
 
 /// When a PSNR was first reached; means over the runs that reached it.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Reached {
+pub struct Milestone {
     /// dB.
     pub psnr: f64,
     /// Seconds of training.
@@ -229,17 +229,17 @@ pub struct Render {
 
 impl Comparison {
     /// Heading of LPIPS with its network, or with all networks if the runs differ.
-    pub fn lpips_head(&self) -> String {
-        self.head_of(|figures| figures.lpips_net.as_deref())
+    pub fn lpips_heading(&self) -> String {
+        self.heading_for(|figures| figures.lpips_net.as_deref())
             .unwrap_or("LPIPS".to_owned())
     }
 
     /// Heading of the LPIPS of a network that training does not see; `None` if no run has one.
-    pub fn unseen_lpips_head(&self) -> Option<String> {
-        self.head_of(|figures| figures.unseen_lpips_net.as_deref())
+    pub fn unseen_lpips_heading(&self) -> Option<String> {
+        self.heading_for(|figures| figures.unseen_lpips_net.as_deref())
     }
 
-    fn head_of<'a>(&'a self, net: impl Fn(&'a Figures) -> Option<&'a str>) -> Option<String> {
+    fn heading_for<'a>(&'a self, net: impl Fn(&'a Figures) -> Option<&'a str>) -> Option<String> {
         let mut nets: Vec<&str> = all_figures(&self.scenes)
             .filter_map(|(_, figures)| net(figures))
             .collect();
@@ -250,7 +250,7 @@ impl Comparison {
 }
 
 /// A note for each recipe that was trained on the perceptual distance by which it is scored.
-pub fn flattered(scenes: &[Scene]) -> Vec<String> {
+pub fn lpips_bias_notes(scenes: &[Scene]) -> Vec<String> {
     let line = |(recipe, figures): (&str, &Figures)| {
         let net = figures.trained_on_lpips.as_deref()?;
         let other = figures.unseen_lpips_net.as_ref();
@@ -319,9 +319,9 @@ impl Figures {
             unseen_lpips: report.unseen_lpips,
             unseen_lpips_net: report.unseen_lpips_net.clone(),
             trained_on_lpips: report.trained_on_lpips.clone(),
-            loss_rises: rises(&report.curve.iter().map(|point| point.loss).collect::<Vec<_>>()),
-            error_rises: rises(errors),
-            psnr_falls: falls(&evaluations),
+            loss_rises: rise_fraction(&report.curve.iter().map(|point| point.loss).collect::<Vec<_>>()),
+            error_rises: rise_fraction(errors),
+            psnr_falls: fall_fraction(&evaluations),
             evaluations,
         }
     }
@@ -351,9 +351,13 @@ impl Scene {
                 let spread = |of: &dyn Fn(&Figures) -> Option<f64>| Spread::of(figures.iter().filter_map(of));
                 let times = |psnr: f64| {
                     let at = |axis: fn(&EvaluationPoint) -> f64| {
-                        Spread::of(figures.iter().filter_map(|f| reached(&f.evaluations, psnr, axis)))
+                        Spread::of(
+                            figures
+                                .iter()
+                                .filter_map(|f| position_at_psnr(&f.evaluations, psnr, axis)),
+                        )
                     };
-                    Reached {
+                    Milestone {
                         psnr,
                         seconds: at(|point| point.seconds),
                         steps: at(|point| point.step as f64),

@@ -2,7 +2,7 @@
 //! can be shared as one file.
 
 use super::Comparison;
-use crate::report::filled;
+use crate::report::fill_page;
 use irradia_scene::base64;
 
 const PAGE: &str = include_str!("page.html");
@@ -11,7 +11,7 @@ const SCRIPT: &str = include_str!("page.js");
 
 /// The page; all text is embedded as data that the script sets as text, never as markup.
 pub fn to_html(comparison: &Comparison) -> String {
-    filled(PAGE, STYLE, SCRIPT, comparison)
+    fill_page(PAGE, STYLE, SCRIPT, comparison)
 }
 
 /// A JPEG file as a `data:` URL.

@@ -62,8 +62,8 @@ pub fn published(protocol: &str, scene: &str, name: &str) -> Vec<Published> {
 
 /// Our rows and the published ones, scene by scene, below their headings; `None` without published ones.
 pub(super) fn lines(comparison: &Comparison) -> Option<Vec<Vec<String>>> {
-    let heads = ["scene", "method", "PSNR, dB", "SSIM", "LPIPS (vgg)"];
-    let mut lines = vec![heads.map(str::to_owned).to_vec()];
+    let headings = ["scene", "method", "PSNR, dB", "SSIM", "LPIPS (vgg)"];
+    let mut lines = vec![headings.map(str::to_owned).to_vec()];
     let cell = |value: Option<f64>, digits: usize| value.map_or("–".to_owned(), |v| format!("{v:.digits$}"));
     for scene in &comparison.scenes {
         let mut theirs = comparison.published.iter().filter(|p| p.scene == scene.name).peekable();

@@ -1,12 +1,12 @@
 //! The comparison as a plain table for a terminal and as Markdown.
 
-use super::{Comparison, Entry, Reached, Spread, published};
+use super::{Comparison, Entry, Milestone, Spread, published};
 use crate::report::columns;
 
-fn heads(comparison: &Comparison) -> Vec<String> {
-    let mut heads: Vec<String> = ["scene", "recipe", "PSNR, dB", "SSIM"].map(str::to_owned).to_vec();
-    heads.push(comparison.lpips_head());
-    heads.extend(comparison.unseen_lpips_head());
+fn headings(comparison: &Comparison) -> Vec<String> {
+    let mut headings: Vec<String> = ["scene", "recipe", "PSNR, dB", "SSIM"].map(str::to_owned).to_vec();
+    headings.push(comparison.lpips_heading());
+    headings.extend(comparison.unseen_lpips_heading());
     let rest = [
         "train, s",
         "CPU, s",
@@ -16,15 +16,15 @@ fn heads(comparison: &Comparison) -> Vec<String> {
         "error rises",
         "runs",
     ];
-    heads.extend(rest.map(str::to_owned));
-    heads
+    headings.extend(rest.map(str::to_owned));
+    headings
 }
 
 /// The table with aligned columns; errors and explanations follow it.
 pub fn to_text(comparison: &Comparison) -> String {
-    let mut text = columns(&[vec![heads(comparison)], rows(comparison)].concat(), 2);
-    if let Some(lines) = marks(comparison) {
-        text += &format!("\n{MARKS}:\n{}", columns(&lines, 1));
+    let mut text = columns(&[vec![headings(comparison)], rows(comparison)].concat(), 2);
+    if let Some(lines) = marks_table(comparison) {
+        text += &format!("\n{MARKS_TITLE}:\n{}", columns(&lines, 1));
     }
     for line in errors(comparison) {
         text += &format!("failed: {line}\n");
@@ -36,17 +36,17 @@ pub fn to_text(comparison: &Comparison) -> String {
     text
 }
 
-/// Title of the table of [`marks`].
-const MARKS: &str = "Seconds of training until a recipe reaches the first one's final PSNR; in brackets, divided by the seconds of \
+/// Title of the table of [`marks_table`].
+const MARKS_TITLE: &str = "Seconds of training until a recipe reaches the first one's final PSNR; in brackets, divided by the seconds of \
                      the first one's whole run";
 
 /// One row per scene and one column per recipe, below their headings; `None` if there is nothing to show.
-fn marks(comparison: &Comparison) -> Option<Vec<Vec<String>>> {
+fn marks_table(comparison: &Comparison) -> Option<Vec<Vec<String>>> {
     let first = comparison.scenes.first()?;
     let name = &first.entries.first()?.recipe;
-    let mut heads = vec!["scene".to_owned(), format!("{name} ends with"), "after".to_owned()];
-    heads.extend(first.entries.iter().map(|entry| entry.recipe.clone()));
-    let mut lines = vec![heads];
+    let mut headings = vec!["scene".to_owned(), format!("{name} ends with"), "after".to_owned()];
+    headings.extend(first.entries.iter().map(|entry| entry.recipe.clone()));
+    let mut lines = vec![headings];
     for scene in &comparison.scenes {
         let Some(mark) = scene.mark else { continue };
         let mut cells = vec![
@@ -68,7 +68,7 @@ fn marks(comparison: &Comparison) -> Option<Vec<Vec<String>>> {
 /// The tables for a results page: one of figures, one of the times to each whole dB.
 pub fn to_markdown(comparison: &Comparison) -> String {
     let mut text = format!("{}. {}.\n\n", comparison.conditions.join(", "), comparison.device);
-    text += &markdown(&[vec![heads(comparison)], rows(comparison)].concat(), 2);
+    text += &markdown(&[vec![headings(comparison)], rows(comparison)].concat(), 2);
     text.push('\n');
     for line in errors(comparison) {
         text += &format!("- failed: {}\n", escaped(&line));
@@ -85,8 +85,8 @@ pub fn to_markdown(comparison: &Comparison) -> String {
             text += &format!("- {}\n", escaped(&source));
         }
     }
-    if let Some(lines) = marks(comparison) {
-        text += &format!("\n{MARKS}:\n\n{}", markdown(&lines, 1));
+    if let Some(lines) = marks_table(comparison) {
+        text += &format!("\n{MARKS_TITLE}:\n\n{}", markdown(&lines, 1));
     }
     for scene in &comparison.scenes {
         let Some(first) = scene.entries.first() else { continue };
@@ -96,8 +96,8 @@ pub fn to_markdown(comparison: &Comparison) -> String {
         if whole.is_empty() {
             continue;
         }
-        let heads = whole.iter().map(|i| format!("{:.0} dB", first.reached[*i].psnr));
-        let heads: Vec<String> = std::iter::once("recipe".to_owned()).chain(heads).collect();
+        let headings = whole.iter().map(|i| format!("{:.0} dB", first.reached[*i].psnr));
+        let headings: Vec<String> = std::iter::once("recipe".to_owned()).chain(headings).collect();
         text += &format!(
             "\nSeconds of training until the held-out PSNR is reached, {}:\n\n",
             escaped(&scene.name)
@@ -106,13 +106,13 @@ pub fn to_markdown(comparison: &Comparison) -> String {
             let times = whole.iter().map(|i| time(entry, entry.reached.get(*i)));
             std::iter::once(entry.recipe.clone()).chain(times).collect()
         });
-        text += &markdown(&std::iter::once(heads).chain(rows).collect::<Vec<_>>(), 1);
+        text += &markdown(&std::iter::once(headings).chain(rows).collect::<Vec<_>>(), 1);
     }
     text
 }
 
 /// Mean seconds to a level, and the number of runs that reached it, if not all.
-fn time(entry: &Entry, level: Option<&Reached>) -> String {
+fn time(entry: &Entry, level: Option<&Milestone>) -> String {
     let finished = entry.runs.iter().filter(|run| run.figures.is_some()).count();
     match level.and_then(|reached| reached.seconds) {
         None => "–".into(),
@@ -123,7 +123,7 @@ fn time(entry: &Entry, level: Option<&Reached>) -> String {
 
 fn rows(comparison: &Comparison) -> Vec<Vec<String>> {
     let mut rows = Vec::new();
-    let has_unseen = comparison.unseen_lpips_head().is_some();
+    let has_unseen = comparison.unseen_lpips_heading().is_some();
     for scene in &comparison.scenes {
         for entry in &scene.entries {
             let done = entry.runs.iter().filter(|run| run.figures.is_some()).count();
@@ -163,7 +163,7 @@ fn rows(comparison: &Comparison) -> Vec<Vec<String>> {
                 format!("{:.1}", o.seconds),
                 dash(),
                 o.parameters
-                    .map_or_else(|| o.splats.map_or_else(dash, |n| format!("{n:.0}")), of_field),
+                    .map_or_else(|| o.splats.map_or_else(dash, |n| format!("{n:.0}")), format_parameters),
                 dash(),
                 dash(),
                 dash(),
@@ -177,11 +177,11 @@ fn rows(comparison: &Comparison) -> Vec<Vec<String>> {
 
 /// Number of splats, or of parameters of a field.
 fn size(entry: &Entry) -> String {
-    let parameters = entry.parameters.map(|spread| of_field(spread.mean));
+    let parameters = entry.parameters.map(|spread| format_parameters(spread.mean));
     parameters.unwrap_or_else(|| number(entry.splats, 0, 1.0))
 }
 
-fn of_field(parameters: f64) -> String {
+fn format_parameters(parameters: f64) -> String {
     format!("{parameters:.0} parameters")
 }
 

@@ -62,7 +62,7 @@ fn a_second_network_and_published_figures_are_shown_beside_ours() {
     let runs = vec![("curriculum".to_owned(), vec![run(0, Some(trained))])];
     let scenes = vec![Scene::new("chair".into(), "data/chair".into(), runs, None)];
     let comparison = Comparison {
-        notes: flattered(&scenes),
+        notes: lpips_bias_notes(&scenes),
         published: published("blender", "chair", "chair"),
         scenes,
         ..Comparison::default()
@@ -105,8 +105,8 @@ fn tables_name_the_network_of_lpips() {
             ..Comparison::default()
         };
         let (text, markdown) = (to_text(&comparison), to_markdown(&comparison));
-        assert!(text.contains(&comparison.lpips_head()) && markdown.contains(&comparison.lpips_head()));
-        comparison.lpips_head()
+        assert!(text.contains(&comparison.lpips_heading()) && markdown.contains(&comparison.lpips_heading()));
+        comparison.lpips_heading()
     };
     assert_eq!(head(&["alex", "alex"]), "LPIPS (alex)");
     assert_eq!(head(&["squeeze", "alex"]), "LPIPS (alex, squeeze)");
@@ -132,31 +132,31 @@ fn levels_are_interpolated_between_evaluations() {
         point(30, 5.0, 22.0),
         point(40, 9.0, 25.0),
     ];
-    let seconds = |psnr| reached(&evaluations, psnr, |l| l.seconds);
+    let seconds = |psnr| position_at_psnr(&evaluations, psnr, |l| l.seconds);
     assert_eq!(seconds(21.0), Some(1.5));
     assert_eq!(seconds(24.0), Some(3.0));
     // Only the first time counts; the fall in between is ignored.
     assert_eq!(seconds(25.0), Some(9.0));
     assert_eq!(seconds(19.0), Some(1.0), "no later than the first evaluation");
     assert_eq!(seconds(25.1), None);
-    assert_eq!(reached(&evaluations, 22.0, |l| l.step as f64), Some(15.0));
-    assert_eq!(falls(&evaluations), Some(1.0 / 3.0));
-    assert_eq!(falls(&evaluations[..1]), None);
+    assert_eq!(position_at_psnr(&evaluations, 22.0, |l| l.step as f64), Some(15.0));
+    assert_eq!(fall_fraction(&evaluations), Some(1.0 / 3.0));
+    assert_eq!(fall_fraction(&evaluations[..1]), None);
 }
 
 #[test]
 fn rises_are_counted_between_blocks() {
     let falling: Vec<f64> = (0..100).map(|i| 1.0 / f64::from(i + 1)).collect();
-    assert_eq!(rises(&falling), Some(0.0));
+    assert_eq!(rise_fraction(&falling), Some(0.0));
     let rising: Vec<f64> = falling.iter().rev().copied().collect();
-    assert_eq!(rises(&rising), Some(1.0));
+    assert_eq!(rise_fraction(&rising), Some(1.0));
     // Alternating from step to step, but falling over ten.
     let noisy: Vec<f64> = (0..100)
         .map(|i| 10.0 - 0.05 * f64::from(i) + f64::from(i % 2))
         .collect();
-    assert_eq!(rises(&noisy), Some(0.0));
-    assert_eq!(rises(&[1.0; 9]), None);
-    assert_eq!(rises(&[f64::NAN; 50]), None);
+    assert_eq!(rise_fraction(&noisy), Some(0.0));
+    assert_eq!(rise_fraction(&[1.0; 9]), None);
+    assert_eq!(rise_fraction(&[f64::NAN; 50]), None);
 }
 
 #[test]

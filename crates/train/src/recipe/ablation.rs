@@ -41,7 +41,7 @@ impl Default for Ingredients {
 
 impl Ingredients {
     /// Whether all are active.
-    pub fn are_all(&self) -> bool {
+    pub fn all_active(&self) -> bool {
         *self == Self::default()
     }
 
@@ -55,7 +55,7 @@ impl Ingredients {
         }
         if !self.loss_schedule {
             // The values of a parameter are those of the last stage that sets it.
-            for param in Param::ALL.into_iter().filter(|param| param.is_of_loss()) {
+            for param in Param::ALL.into_iter().filter(|param| param.is_loss_param()) {
                 let last = recipe
                     .stage
                     .iter()
@@ -98,7 +98,7 @@ mod tests {
         let exits = |recipe: &Recipe| recipe.stage.iter().any(|stage| stage.exit.is_some());
         let stage_losses = |recipe: &Recipe| {
             let mut knobs = recipe.stage.iter().flat_map(|stage| stage.params.keys());
-            knobs.any(|param| param.is_of_loss())
+            knobs.any(|param| param.is_loss_param())
         };
         let found = |recipe: &Recipe| {
             [

@@ -16,7 +16,7 @@ pub enum Choice {
 }
 
 impl Choice {
-    pub(super) fn is_no(&self) -> bool {
+    pub(super) fn is_disabled(&self) -> bool {
         *self == Self::No
     }
 }

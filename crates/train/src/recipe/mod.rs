@@ -120,14 +120,14 @@ documented! {
         #[serde(default, skip_serializing_if = "RegularizerKnobs::is_default")]
         pub regularizers: RegularizerKnobs,
         /// The active ingredients of a curriculum.
-        #[serde(default, skip_serializing_if = "Ingredients::are_all")]
+        #[serde(default, skip_serializing_if = "Ingredients::all_active")]
         pub ingredients: Ingredients,
         /// The radiance field of the stages that train one.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         pub field: Option<FieldKnobs>,
         /// Train a separate exposure and white balance, an affine colour map, for each photograph; with `auto` if, after a tenth
         /// of the run, photographs differ in exposure beyond what adjacent cameras predict.
-        #[serde(default, skip_serializing_if = "Choice::is_no")]
+        #[serde(default, skip_serializing_if = "Choice::is_disabled")]
         pub exposure: Choice,
         /// Train the vignette of each lens, a polynomial in the distance from the principal point, the same in all of its photographs. The
         /// scene does not contain it; held-out views are compared with it.
@@ -387,7 +387,7 @@ impl Recipe {
         };
         let table: toml::Table = text
             .parse()
-            .map_err(|e: toml::de::Error| invalid(format!("{}{}", one_line(&e), place(&e))))?;
+            .map_err(|e: toml::de::Error| invalid(format!("{}{}", one_line(&e), location(&e))))?;
         let mut root = toml::Value::Table(table);
         for assignment in overrides {
             apply(&mut root, assignment).map_err(|message| RecipeError::Override {
@@ -396,7 +396,7 @@ impl Recipe {
             })?;
         }
         let mut recipe = Self::deserialize(root).map_err(|e| {
-            let message = format!("{}{}", suggest(&one_line(&e)), place(&e));
+            let message = format!("{}{}", suggest(&one_line(&e)), location(&e));
             let given: Vec<String> = overrides.iter().map(|o| format!("--set {o}")).collect();
             match &given[..] {
                 [] => invalid(message),
@@ -651,7 +651,7 @@ fn one_line(error: &toml::de::Error) -> String {
 }
 
 /// The position of an error: line and column, or the key. Only the error's long form contains it.
-fn place(error: &toml::de::Error) -> String {
+fn location(error: &toml::de::Error) -> String {
     let long = error.to_string();
     let in_text = long.lines().next().and_then(|line| line.split_once(" at line "));
     let in_key = long.lines().find_map(|line| line.strip_prefix("in "));

@@ -30,7 +30,7 @@ impl Param {
     }
 
     /// Whether it belongs to a loss.
-    pub fn is_of_loss(self) -> bool {
+    pub fn is_loss_param(self) -> bool {
         matches!(self.row().group, Group::Loss | Group::PartOf(_))
     }
 }

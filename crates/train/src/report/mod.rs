@@ -110,14 +110,14 @@ pub struct Report {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Breakdown {
     /// Between the first step and the last.
-    pub inside: Inside,
+    pub inside: InsideLoop,
     /// Before the first step and after the last.
-    pub beside: Beside,
+    pub beside: OutsideLoop,
 }
 
 /// Wall-clock seconds between a run's first step and its last.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Inside {
+pub struct InsideLoop {
     /// The steps, without density control.
     pub steps: f64,
     /// Density control.
@@ -136,14 +136,14 @@ pub struct Inside {
 
 /// Wall-clock seconds before a run's first step and after its last.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Beside {
+pub struct OutsideLoop {
     /// Reading the dataset, creating or reading the initial state.
     pub preparing: f64,
     /// Writing and evaluating the scene.
     pub finishing: f64,
 }
 
-impl Inside {
+impl InsideLoop {
     /// The breakdown of `times` and the seconds of the steps.
     pub fn of(times: &Times, training_seconds: f64) -> Self {
         let Times {
@@ -252,11 +252,11 @@ const WIDGETS: &str = include_str!("widgets.js");
 ///
 /// All text is embedded as data that the script sets as text, never as markup.
 pub fn to_html(report: &Report) -> String {
-    filled(PAGE, "", SCRIPT, report)
+    fill_page(PAGE, "", SCRIPT, report)
 }
 
 /// `page` with the style, scripts and data inserted.
-pub(crate) fn filled(page: &str, style: &str, script: &str, data: &impl Serialize) -> String {
+pub(crate) fn fill_page(page: &str, style: &str, script: &str, data: &impl Serialize) -> String {
     let data = serde_json::to_string(data).expect("plain data always serialises");
     // Within a script element only `<` can end the data (`</script>`, `<!--`); JSON strings may escape any character.
     let data = data.replace('<', "\\u003c");

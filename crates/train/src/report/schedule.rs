@@ -30,7 +30,7 @@ pub struct KnobCurve {
 }
 
 /// Approximate number of samples of a run.
-const SAMPLES: f64 = 160.0;
+const MAX_SAMPLES: f64 = 160.0;
 
 /// The schedule of a run of `recipe` at `clock` with the stages `stages`. `steps` is the number of steps into which it was
 /// fitted, `timed` whether it was fitted into a time budget instead.
@@ -51,7 +51,9 @@ pub fn schedule(recipe: &Recipe, stages: &[StageReport], clock: &Clock, steps: O
     };
     for (i, span) in spans.iter().enumerate() {
         let full = recipe.stage[i].steps as f64;
-        let parts = (SAMPLES * span.lasted / total.max(1.0)).ceil().clamp(1.0, SAMPLES) as usize;
+        let parts = (MAX_SAMPLES * span.lasted / total.max(1.0))
+            .ceil()
+            .clamp(1.0, MAX_SAMPLES) as usize;
         // Just before its end the stage is still current.
         let last = (span.lasted - 1e-3).max(0.0);
         let mut before = 0.0;
@@ -135,7 +137,7 @@ fn spans(recipe: &Recipe, stages: &[StageReport], clock: &Clock, steps: Option<u
 impl Schedule {
     fn push(&mut self, step: f64, recipe: &Recipe, clock: &Clock) {
         if self.knobs.is_empty() {
-            let curves = drawn().map(|(name, _)| KnobCurve {
+            let curves = plotted_params().map(|(name, _)| KnobCurve {
                 name: name.to_owned(),
                 values: Vec::new(),
             });
@@ -143,14 +145,14 @@ impl Schedule {
         }
         self.steps.push(step as f32);
         let plan = plan(recipe, clock);
-        for (knob, (_, param)) in self.knobs.iter_mut().zip(drawn()) {
+        for (knob, (_, param)) in self.knobs.iter_mut().zip(plotted_params()) {
             knob.values.push(plan.value(param));
         }
     }
 }
 
 /// The parameters with curves.
-fn drawn() -> impl Iterator<Item = (&'static str, Param)> {
+fn plotted_params() -> impl Iterator<Item = (&'static str, Param)> {
     let curve = |param: Param| param.row().curve.map(|name| (name, param));
     Param::ALL.into_iter().filter_map(curve)
 }

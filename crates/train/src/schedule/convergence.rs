@@ -18,7 +18,7 @@ pub struct ConvergenceMonitor {
 }
 
 /// Window of the estimate for many views: the maximum number of steps to average over.
-const LONGEST: u64 = 100;
+const MAX_WINDOW: u64 = 100;
 /// Steps between measurements of S if a stage may end by its value.
 pub const MEASURE_EVERY: u64 = 100;
 
@@ -26,7 +26,7 @@ impl ConvergenceMonitor {
     /// Records a step's error, and S if it was measured; `time` is in recipe steps since the start of the stage.
     pub fn observe(&mut self, error: f64, measured: Option<f64>, views: u64, time: f64) {
         self.steps += 1;
-        let window = views.clamp(1, LONGEST);
+        let window = views.clamp(1, MAX_WINDOW);
         // A plain mean until the window is full, then an exponential one.
         self.mean += (error - self.mean) / self.steps.min(window) as f64;
         if let Some(measured) = measured {
@@ -38,8 +38,8 @@ impl ConvergenceMonitor {
     }
 
     /// Whether the stage may end by `exit`. Never before every view (or a hundred) has been seen.
-    pub fn ends(&mut self, exit: &Exit, views: u64, time: f64) -> bool {
-        if self.steps < views.clamp(1, LONGEST) {
+    pub fn should_end(&mut self, exit: &Exit, views: u64, time: f64) -> bool {
+        if self.steps < views.clamp(1, MAX_WINDOW) {
             return false;
         }
         match *exit {

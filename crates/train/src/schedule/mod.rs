@@ -179,8 +179,12 @@ impl Clock {
         let in_stage = self.time - self.stage_time;
         self.monitor
             .observe(metrics.error, metrics.measured, metrics.views, in_stage);
+        if values(recipe, self)[Param::ImageScale] != before[Param::ImageScale] {
+            // Errors of images of different sizes cannot be compared: larger ones have more detail, and a larger error.
+            self.monitor = ConvergenceMonitor::default();
+        }
         let exit = recipe.stage.get(self.stage).and_then(|stage| stage.exit.as_ref());
-        if exit.is_some_and(|exit| self.monitor.ends(exit, metrics.views, in_stage)) {
+        if exit.is_some_and(|exit| self.monitor.should_end(exit, metrics.views, in_stage)) {
             self.leave_early(recipe);
         }
         self.enter_stages(recipe, before)
@@ -344,7 +348,7 @@ pub fn upcoming_views(train: &[usize], seed: u64, clock: &Clock) -> Vec<usize> {
 mod tests {
     use super::*;
 
-    const QUIET: StepMetrics = StepMetrics {
+    const METRICS: StepMetrics = StepMetrics {
         error: 0.1,
         measured: None,
         views: 4,
@@ -389,7 +393,7 @@ mod tests {
         let mut plans = Vec::new();
         while !clock.finished(recipe) {
             plans.push(plan(recipe, &clock));
-            clock.tick(recipe, pace, QUIET);
+            clock.tick(recipe, pace, METRICS);
         }
         plans
     }
@@ -480,9 +484,9 @@ mod tests {
         let mut recipe = recipe();
         recipe.stage[0].steps = 1;
         let mut clock = Clock::new(&recipe);
-        assert!(clock.tick(&recipe, 5.0, QUIET));
+        assert!(clock.tick(&recipe, 5.0, METRICS));
         assert_eq!((clock.stage, clock.stage_time), (1, 1.0));
-        assert!(clock.tick(&recipe, 100.0, QUIET) && clock.finished(&recipe));
+        assert!(clock.tick(&recipe, 100.0, METRICS) && clock.finished(&recipe));
     }
 
     /// Ticks until the recipe is complete with the errors of `error(step)`; returns the steps after which a stage ended, and plans.
@@ -506,7 +510,10 @@ mod tests {
     }
 
     fn error(value: f64) -> StepMetrics {
-        StepMetrics { error: value, ..QUIET }
+        StepMetrics {
+            error: value,
+            ..METRICS
+        }
     }
 
     #[test]
@@ -519,7 +526,7 @@ mod tests {
         // A measurement takes precedence over the estimate.
         let measured = |step| StepMetrics {
             measured: (step == 99).then_some(0.02),
-            ..QUIET
+            ..METRICS
         };
         assert_eq!(ends(&recipe, measured).0[0], 100);
         assert!(
@@ -550,6 +557,19 @@ mod tests {
         assert_eq!(ends(&recipe, |s| error((-(s as f64) / 100.0).exp())).0[0], 300);
         let (at, _) = ends(&recipe, |s| error((-(s.min(100) as f64) / 100.0).exp()));
         assert!((160..180).contains(&at[0]), "{at:?}");
+    }
+
+    #[test]
+    fn a_plateau_is_judged_anew_when_images_become_larger() {
+        let mut recipe = with_exit(Exit::Plateau { drop: 0.02, window: 60 });
+        let sizes = Knob::Steps {
+            steps: vec![(0, 0.5), (100, 1.0)],
+        };
+        recipe.stage[0].params.insert(Param::ImageScale, sizes);
+        let falling = |s: u64| (-(s as f64) / 100.0).exp();
+        // The error doubles with the size and keeps falling.
+        let (at, _) = ends(&recipe, |s| error(if s < 100 { falling(s) } else { 2.0 * falling(s) }));
+        assert_eq!(at[0], 300);
     }
 
     #[test]

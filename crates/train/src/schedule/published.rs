@@ -8,7 +8,7 @@ const STEPS: u64 = 30_000;
 
 /// An action of a step, from 1.
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum Happens {
+enum Action {
     /// A stage begins with this step.
     Stage,
     /// One SH band more from this step on.
@@ -27,7 +27,7 @@ enum Happens {
     LastRound,
 }
 
-type Events = Vec<(u64, Happens)>;
+type Events = Vec<(u64, Action)>;
 
 /// The actions of the recipe.
 fn of_recipe(name: &str) -> Events {
@@ -44,19 +44,19 @@ fn of_recipe(name: &str) -> Events {
         let plan = plan(&recipe, &clock);
         let step = clock.step + 1;
         if clock.stage_step == clock.step {
-            events.push((step, Happens::Stage));
+            events.push((step, Action::Stage));
         }
         if plan.sh_degree != bands {
             bands = plan.sh_degree;
-            events.push((step, Happens::Bands(bands)));
+            events.push((step, Action::Bands(bands)));
         }
         if plan.gathers.is_some() != gathers {
             gathers = !gathers;
-            events.push((step, Happens::Gathers(gathers)));
+            events.push((step, Action::Gathers(gathers)));
         }
         if (plan.value(Param::Noise) > 0.0) != noise {
             noise = !noise;
-            events.push((step, Happens::Noise(noise)));
+            events.push((step, Action::Noise(noise)));
         }
         if let Some(round) = plan.densify {
             last_round = step;
@@ -64,19 +64,19 @@ fn of_recipe(name: &str) -> Events {
             events.push((
                 step,
                 match round.density {
-                    DensityControl::Mcmc(_) => Happens::Relocate,
-                    _ => Happens::Densify { oversized },
+                    DensityControl::Mcmc(_) => Action::Relocate,
+                    _ => Action::Densify { oversized },
                 },
             ));
         }
         if plan.reset_opacity.is_some() {
-            events.push((step, Happens::Reset));
+            events.push((step, Action::Reset));
         }
         assert!(plan.merge.is_none() && plan.image_scale == 1.0, "{name}: step {step}");
         clock.tick(&recipe, 1.0, metrics);
     }
     assert_eq!(clock.step, STEPS, "{name}");
-    events.push((last_round + 1, Happens::LastRound));
+    events.push((last_round + 1, Action::LastRound));
     events.sort_by_key(|(step, _)| *step);
     events
 }
@@ -84,34 +84,34 @@ fn of_recipe(name: &str) -> Events {
 /// `train.py` of 3DGS (Kerbl et al. 2023), which Taming 3DGS follows except in how a round selects; a black background.
 fn of_3dgs() -> Events {
     let (densify_from, densify_until, interval, reset_interval) = (500, 15_000, 100, 3000);
-    let mut events = vec![(1, Happens::Stage), (1, Happens::Gathers(true))];
+    let mut events = vec![(1, Action::Stage), (1, Action::Gathers(true))];
     let mut active_sh_degree = 0;
     for iteration in 1..=STEPS {
         if iteration == densify_from + 1 {
-            events.push((iteration, Happens::Stage));
+            events.push((iteration, Action::Stage));
         }
         if iteration == densify_until {
-            events.push((iteration, Happens::Stage));
+            events.push((iteration, Action::Stage));
         }
         if iteration.is_multiple_of(1000) && active_sh_degree < 3 {
             active_sh_degree += 1;
-            events.push((iteration, Happens::Bands(active_sh_degree)));
+            events.push((iteration, Action::Bands(active_sh_degree)));
         }
         if iteration == densify_until {
-            events.push((iteration, Happens::Gathers(false)));
+            events.push((iteration, Action::Gathers(false)));
         }
         if iteration < densify_until {
             if iteration > densify_from && iteration.is_multiple_of(interval) {
                 // `size_threshold`; its screen-size criterion compares zeroed sizes.
                 let oversized = iteration > reset_interval;
-                events.push((iteration, Happens::Densify { oversized }));
+                events.push((iteration, Action::Densify { oversized }));
             }
             if iteration.is_multiple_of(reset_interval) {
-                events.push((iteration, Happens::Reset));
+                events.push((iteration, Action::Reset));
             }
         }
     }
-    events.push((14_901, Happens::LastRound));
+    events.push((14_901, Action::LastRound));
     events.sort_by_key(|(step, _)| *step);
     events
 }
@@ -119,21 +119,21 @@ fn of_3dgs() -> Events {
 /// `train.py` of 3DGS-MCMC (Kheradmand et al. 2024), except for the last step, in which its optimiser is skipped.
 fn of_mcmc() -> Events {
     let (densify_from, densify_until, interval) = (500, 25_000, 100);
-    let mut events = vec![(1, Happens::Stage), (1, Happens::Noise(true))];
+    let mut events = vec![(1, Action::Stage), (1, Action::Noise(true))];
     let mut active_sh_degree = 0;
     for iteration in 1..=STEPS {
         if iteration == densify_from + 1 || iteration == densify_until {
-            events.push((iteration, Happens::Stage));
+            events.push((iteration, Action::Stage));
         }
         if iteration.is_multiple_of(1000) && active_sh_degree < 3 {
             active_sh_degree += 1;
-            events.push((iteration, Happens::Bands(active_sh_degree)));
+            events.push((iteration, Action::Bands(active_sh_degree)));
         }
         if iteration < densify_until && iteration > densify_from && iteration.is_multiple_of(interval) {
-            events.push((iteration, Happens::Relocate));
+            events.push((iteration, Action::Relocate));
         }
     }
-    events.push((24_901, Happens::LastRound));
+    events.push((24_901, Action::LastRound));
     events.sort_by_key(|(step, _)| *step);
     events
 }
@@ -145,8 +145,8 @@ fn compare(name: &str, got: &Events, published: &Events) {
     assert_eq!(got.len(), published.len(), "{name}");
 }
 
-fn count(events: &Events, what: impl Fn(&Happens) -> bool) -> usize {
-    events.iter().filter(|(_, happens)| what(happens)).count()
+fn count(events: &Events, what: impl Fn(&Action) -> bool) -> usize {
+    events.iter().filter(|(_, action)| what(action)).count()
 }
 
 #[test]
@@ -154,23 +154,19 @@ fn actions_in_30000_steps_match_the_published_code() {
     let published = of_3dgs();
     let resets: Vec<u64> = published
         .iter()
-        .filter(|(_, happens)| *happens == Happens::Reset)
+        .filter(|(_, action)| *action == Action::Reset)
         .map(|(step, _)| *step)
         .collect();
     assert_eq!(resets, [3000, 6000, 9000, 12_000]);
-    let rounds = |oversized| count(&published, |happens| *happens == Happens::Densify { oversized });
+    let rounds = |oversized| count(&published, |action| *action == Action::Densify { oversized });
     assert_eq!((rounds(false), rounds(true)), (25, 119), "600 to 3000, 3100 to 14900");
     for name in ["classic", "absgrad", "taming"] {
         compare(name, &of_recipe(name), &published);
     }
     // Relocation needs no statistics, but gathering them costs hardly anything.
     let mut mcmc = of_recipe("mcmc");
-    mcmc.retain(|(_, happens)| !matches!(happens, Happens::Gathers(_)));
-    assert_eq!(
-        count(&mcmc, |happens| *happens == Happens::Relocate),
-        244,
-        "600 to 24900"
-    );
+    mcmc.retain(|(_, action)| !matches!(action, Action::Gathers(_)));
+    assert_eq!(count(&mcmc, |action| *action == Action::Relocate), 244, "600 to 24900");
     compare("mcmc", &mcmc, &of_mcmc());
 }
 

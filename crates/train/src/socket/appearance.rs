@@ -37,13 +37,13 @@ impl Appearance {
     }
 
     /// Whether it adds to the frame of `plan`. Once it has begun it stays active.
-    pub fn acts(&self, plan: &StepPlan) -> bool {
-        plan.value(Param::RateCodes) > 0.0 || self.learnt().is_some()
+    pub fn is_active(&self, plan: &StepPlan) -> bool {
+        plan.value(Param::RateCodes) > 0.0 || self.trained_field().is_some()
     }
 
     /// The field, once trained.
-    pub fn learnt(&self) -> Option<&Field> {
-        self.0.learnt()
+    pub fn trained_field(&self) -> Option<&Field> {
+        self.0.trained_field()
     }
 
     /// Forward: the colours to add to `surfaces` seen from `center` in the light of `view`.

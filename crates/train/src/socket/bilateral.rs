@@ -7,7 +7,7 @@
 //!
 //! `t` is a position in the grid, in cells from its first one; `w` is the weight of the cell after it, and 1 - w that of the cell before.
 
-use super::{Occupant, pieces};
+use super::{Occupant, pixel_chunks};
 use crate::tensor_file::{NamedTensor, TensorSource, to_bytes};
 use irradia_compute::adam::{Active, AdamRates, AdamStep, adam};
 use irradia_compute::simd::{Kernel, Lanes, Simd};
@@ -19,17 +19,17 @@ use rayon::prelude::*;
 /// Wang et al. use 16 x 16 x 8, for tens of thousands of steps. Here a photograph is used 30 to 100 times in a run, which does not
 /// determine more cells than this: on fox with synthetic gains, 16 x 16 x 8 ends 1.8 dB lower with their weight of the variation, and takes
 /// eight times the memory.
-const SIZE: [usize; 3] = [8, 8, 4];
-const CELLS: usize = SIZE[0] * SIZE[1] * SIZE[2];
+const GRID_SIZE: [usize; 3] = [8, 8, 4];
+const CELLS: usize = GRID_SIZE[0] * GRID_SIZE[1] * GRID_SIZE[2];
 /// Cells of a row of the grid.
-const ROW: usize = SIZE[1] * SIZE[2];
+const ROW_CELLS: usize = GRID_SIZE[1] * GRID_SIZE[2];
 /// Parameters of a cell: A row by row, then b.
 const N: usize = 12;
 const IDENTITY: [f32; N] = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0];
 /// Weights of a colour's channels in its brightness (Rec. 601).
 const LUMA: [f32; 3] = [0.299, 0.587, 0.114];
 /// Rows of pixels whose gradients are summed together: a fixed number, so that the sum does not depend on threads.
-const ROWS: usize = 8;
+const ROWS_PER_TASK: usize = 8;
 /// Adam's constants as published (Kingma and Ba 2015).
 const BETAS: [f32; 2] = [0.9, 0.999];
 const EPSILON: f32 = 1e-15;
@@ -37,7 +37,7 @@ const EPSILON: f32 = 1e-15;
 /// A cell in the layout in which it is applied: the factors of red, green, blue and 1, each for three channels and a lane of padding.
 type Map = [f32; LANES];
 const LANES: usize = 16;
-const NOTHING: Map = [0.0; LANES];
+const ZERO_MAP: Map = [0.0; LANES];
 
 /// A grid of colour maps per view, initially the identity. As with exposures, the mean over the training views of each cell stays
 /// the identity: a change common to all photographs belongs to the scene, which would otherwise drift to a look that no photograph has.
@@ -49,7 +49,7 @@ const NOTHING: Map = [0.0; LANES];
 #[derive(Clone, Debug, PartialEq)]
 pub struct BilateralGrid {
     /// Own cells and moments of the views that have made a step: 37 KB each.
-    views: Vec<Option<Learnt>>,
+    views: Vec<Option<ViewGrid>>,
     /// Mean of the training views' own cells, `[CELLS][N]`.
     mean: Vec<f32>,
     /// The training views.
@@ -58,7 +58,7 @@ pub struct BilateralGrid {
 
 /// What is learnt for a view.
 #[derive(Clone, Debug, PartialEq)]
-struct Learnt {
+struct ViewGrid {
     /// One plane, `[CELLS][N]`.
     own: Planes,
     /// First and second moments, of the same shape.
@@ -67,7 +67,7 @@ struct Learnt {
     steps: u64,
 }
 
-impl Learnt {
+impl ViewGrid {
     fn new() -> Self {
         let zeros = || Planes::zeros(1, CELLS * N);
         Self {
@@ -94,8 +94,8 @@ impl BilateralGrid {
         if self.train.contains(&view) {
             grid.iter_mut().zip(&self.mean).for_each(|(value, mean)| *value -= mean);
         }
-        if let Some(learnt) = &self.views[view] {
-            let own = learnt.own.as_slice();
+        if let Some(view_grid) = &self.views[view] {
+            let own = view_grid.own.as_slice();
             grid.iter_mut().zip(own).for_each(|(value, own)| *value += own);
         }
         grid
@@ -106,14 +106,16 @@ impl BilateralGrid {
         let grid = self.grid(view);
         to.resize(color.len(), 0.0);
         let (level, frame) = (Level::detect(), Frame::new(&grid, width, color));
-        pieces(to, ROWS * width).enumerate().for_each(|(piece, to)| {
-            let first_row = piece * ROWS;
-            level.run(DevelopRows {
-                frame: &frame,
-                first_row,
-                to,
+        pixel_chunks(to, ROWS_PER_TASK * width)
+            .enumerate()
+            .for_each(|(piece, to)| {
+                let first_row = piece * ROWS_PER_TASK;
+                level.run(DevelopRows {
+                    frame: &frame,
+                    first_row,
+                    to,
+                });
             });
-        });
     }
 
     /// The vector-Jacobian product of [`Self::develop`]: `v` `[3, H, W]` becomes the gradient of `color`; returns that of the view's
@@ -130,18 +132,18 @@ impl BilateralGrid {
         if gradient.iter().any(|g| !g.is_finite()) {
             return;
         }
-        let learnt = self.views[view].get_or_insert_with(Learnt::new);
-        learnt.steps += 1;
-        let before = learnt.own.clone();
+        let view_grid = self.views[view].get_or_insert_with(ViewGrid::new);
+        view_grid.steps += 1;
+        let before = view_grid.own.clone();
         let step = AdamStep {
             beta1: BETAS[0],
             beta2: BETAS[1],
             epsilon: EPSILON,
-            step: learnt.steps,
+            step: view_grid.steps,
         };
-        let [first, second] = &mut learnt.moments;
+        let [first, second] = &mut view_grid.moments;
         let gradient = Planes::from_interleaved(1, &gradient);
-        let (own, moments) = (&mut learnt.own, [first, second]);
+        let (own, moments) = (&mut view_grid.own, [first, second]);
         let rates = AdamRates::of_planes(std::slice::from_ref(&rate));
         adam(Level::detect(), own, &gradient, moments, rates, Active::All, step);
         let share = 1.0 / self.train.len() as f32;
@@ -167,14 +169,17 @@ fn cell(i: usize, count: usize, size: usize) -> (usize, f32) {
     (before, t - before as f32)
 }
 
-/// The maps at a row of pixels, between two rows of the grid, `[ROW]`.
+/// The maps at a row of pixels, between two rows of the grid, `[ROW_CELLS]`.
 #[inline(always)]
 fn maps_of_row(grid: &[f32], (before, w): (usize, f32), to: &mut Vec<Map>) {
     let rows = grid.as_chunks::<N>().0;
-    let (upper, lower) = (&rows[before * ROW..][..ROW], &rows[(before + 1) * ROW..][..ROW]);
+    let (upper, lower) = (
+        &rows[before * ROW_CELLS..][..ROW_CELLS],
+        &rows[(before + 1) * ROW_CELLS..][..ROW_CELLS],
+    );
     to.clear();
     to.extend(upper.iter().zip(lower).map(|(upper, lower)| {
-        let mut map = NOTHING;
+        let mut map = ZERO_MAP;
         for (i, (upper, lower)) in upper.iter().zip(lower).enumerate() {
             map[lane(i)] = upper + w * (lower - upper);
         }
@@ -198,11 +203,11 @@ impl Slice {
     #[inline(always)]
     fn new((column, w_column): (usize, f32), x: [f32; 3]) -> Self {
         let luma = LUMA[0] * x[0] + LUMA[1] * x[1] + LUMA[2] * x[2];
-        let most = (SIZE[2] - 1) as f32;
+        let most = (GRID_SIZE[2] - 1) as f32;
         let t = luma.clamp(0.0, 1.0) * most;
-        let before = (t as usize).min(SIZE[2] - 2);
+        let before = (t as usize).min(GRID_SIZE[2] - 2);
         Self {
-            at: column * SIZE[2] + before,
+            at: column * GRID_SIZE[2] + before,
             w_column,
             w_bright: t - before as f32,
             slope: if (0.0..=1.0).contains(&luma) { most } else { 0.0 },
@@ -212,7 +217,7 @@ impl Slice {
     /// The maps between the darker cells, and between the brighter ones.
     #[inline(always)]
     fn maps(&self, maps: &[Map]) -> [Map; 2] {
-        let (before, after) = (&maps[self.at..][..2], &maps[self.at + SIZE[2]..][..2]);
+        let (before, after) = (&maps[self.at..][..2], &maps[self.at + GRID_SIZE[2]..][..2]);
         [0, 1].map(|i| mix(&before[i], &after[i], self.w_column))
     }
 
@@ -237,11 +242,11 @@ impl Slice {
             let row = &map[4 * k..][..3];
             row[0] * v[0] + row[1] * v[1] + row[2] * v[2] + LUMA[k] * v_luma
         });
-        let (terms, mut v_map) = ([x[0], x[1], x[2], 1.0], NOTHING);
+        let (terms, mut v_map) = ([x[0], x[1], x[2], 1.0], ZERO_MAP);
         for i in 0..LANES {
             v_map[i] = terms[i / 4] * v[i % 4];
         }
-        for (after, w) in [(0, 1.0 - self.w_column), (SIZE[2], self.w_column)] {
+        for (after, w) in [(0, 1.0 - self.w_column), (GRID_SIZE[2], self.w_column)] {
             for (brighter, w) in [(0, w * (1.0 - self.w_bright)), (1, w * self.w_bright)] {
                 let sum = &mut v_maps[self.at + after + brighter];
                 for i in 0..LANES {
@@ -255,7 +260,7 @@ impl Slice {
 
 #[inline(always)]
 fn mix(a: &Map, b: &Map, w: f32) -> Map {
-    let mut mixed = NOTHING;
+    let mut mixed = ZERO_MAP;
     for i in 0..LANES {
         mixed[i] = a[i] + w * (b[i] - a[i]);
     }
@@ -264,7 +269,7 @@ fn mix(a: &Map, b: &Map, w: f32) -> Map {
 
 #[inline(always)]
 fn apply(map: &Map, x: [f32; 3]) -> [f32; 4] {
-    let (terms, mut products) = ([x[0], x[1], x[2], 1.0], NOTHING);
+    let (terms, mut products) = ([x[0], x[1], x[2], 1.0], ZERO_MAP);
     for i in 0..LANES {
         products[i] = map[i] * terms[i / 4];
     }
@@ -288,7 +293,7 @@ impl<'a> Frame<'a> {
             grid,
             color,
             height: color.len() / 3 / width.max(1),
-            columns: (0..width).map(|column| cell(column, width, SIZE[1])).collect(),
+            columns: (0..width).map(|column| cell(column, width, GRID_SIZE[1])).collect(),
         }
     }
 
@@ -322,7 +327,7 @@ impl Kernel for DevelopRows<'_> {
         let mut maps = Vec::new();
         for i in 0..red.len() / columns.len() {
             let row = self.first_row + i;
-            maps_of_row(self.frame.grid, cell(row, self.frame.height, SIZE[0]), &mut maps);
+            maps_of_row(self.frame.grid, cell(row, self.frame.height, GRID_SIZE[0]), &mut maps);
             for (column, place) in columns.iter().enumerate() {
                 let at = i * columns.len() + column;
                 let x = self.frame.color(row * columns.len() + column);
@@ -350,14 +355,14 @@ impl Kernel for VjpRows<'_> {
     {
         let (Frame { columns, height, .. }, [red, green, blue]) = (self.frame, self.v);
         let rows = self.first_row..self.first_row + red.len() / columns.len();
-        let first = cell(rows.start, *height, SIZE[0]).0;
-        let last = cell(rows.end - 1, *height, SIZE[0]).0 + 1;
-        let mut sum = vec![NOTHING; (last + 1 - first) * ROW];
-        let (mut maps, mut v_maps) = (Vec::new(), vec![NOTHING; ROW]);
+        let first = cell(rows.start, *height, GRID_SIZE[0]).0;
+        let last = cell(rows.end - 1, *height, GRID_SIZE[0]).0 + 1;
+        let mut sum = vec![ZERO_MAP; (last + 1 - first) * ROW_CELLS];
+        let (mut maps, mut v_maps) = (Vec::new(), vec![ZERO_MAP; ROW_CELLS]);
         for (i, row) in rows.enumerate() {
-            let (before, w) = cell(row, *height, SIZE[0]);
+            let (before, w) = cell(row, *height, GRID_SIZE[0]);
             maps_of_row(self.frame.grid, (before, w), &mut maps);
-            v_maps.fill(NOTHING);
+            v_maps.fill(ZERO_MAP);
             for (column, place) in columns.iter().enumerate() {
                 let at = i * columns.len() + column;
                 let x = self.frame.color(row * columns.len() + column);
@@ -365,7 +370,7 @@ impl Kernel for VjpRows<'_> {
                 [red[at], green[at], blue[at]] = Slice::new(*place, x).vjp(&maps, x, v_y, &mut v_maps);
             }
             for (below, w) in [(0, 1.0 - w), (1, w)] {
-                let sum = &mut sum[(before - first + below) * ROW..][..ROW];
+                let sum = &mut sum[(before - first + below) * ROW_CELLS..][..ROW_CELLS];
                 let values = sum.as_flattened_mut().iter_mut();
                 for (sum, v) in values.zip(v_maps.as_flattened()) {
                     *sum += w * v;
@@ -379,10 +384,10 @@ impl Kernel for VjpRows<'_> {
 /// See [`BilateralGrid::vjp`].
 fn vjp(grid: &[f32], width: usize, color: &[f32], v: &mut [f32]) -> Vec<f32> {
     let (level, frame) = (Level::detect(), Frame::new(grid, width, color));
-    let sums: Vec<(usize, Vec<Map>)> = pieces(v, ROWS * width)
+    let sums: Vec<(usize, Vec<Map>)> = pixel_chunks(v, ROWS_PER_TASK * width)
         .enumerate()
         .map(|(piece, v)| {
-            let first_row = piece * ROWS;
+            let first_row = piece * ROWS_PER_TASK;
             level.run(VjpRows {
                 frame: &frame,
                 first_row,
@@ -392,7 +397,7 @@ fn vjp(grid: &[f32], width: usize, color: &[f32], v: &mut [f32]) -> Vec<f32> {
         .collect();
     let mut total = vec![0.0; CELLS * N];
     for (first, sum) in sums {
-        let cells = total.as_chunks_mut::<N>().0[first * ROW..].iter_mut();
+        let cells = total.as_chunks_mut::<N>().0[first * ROW_CELLS..].iter_mut();
         for (total, map) in cells.zip(sum) {
             for (i, total) in total.iter_mut().enumerate() {
                 *total += map[lane(i)];
@@ -404,11 +409,11 @@ fn vjp(grid: &[f32], width: usize, color: &[f32], v: &mut [f32]) -> Vec<f32> {
 
 /// Adds the gradient of `weight` times the total variation of `grid`: for each axis the mean squared difference of adjacent cells.
 fn add_variation_gradient(grid: &[f32], weight: f32, to: &mut [f32]) {
-    for axis in 0..SIZE.len() {
+    for axis in 0..GRID_SIZE.len() {
         // Distances in memory from a value to that of the next cell along the axis, and from one line of such cells to the next.
-        let stride = SIZE[axis + 1..].iter().product::<usize>() * N;
-        let block = SIZE[axis] * stride;
-        let pairs = (CELLS * N / SIZE[axis]) * (SIZE[axis] - 1);
+        let stride = GRID_SIZE[axis + 1..].iter().product::<usize>() * N;
+        let block = GRID_SIZE[axis] * stride;
+        let pairs = (CELLS * N / GRID_SIZE[axis]) * (GRID_SIZE[axis] - 1);
         let factor = 2.0 * weight / pairs as f32;
         for (grid, to) in grid.chunks_exact(block).zip(to.chunks_exact_mut(block)) {
             for i in 0..block - stride {
@@ -426,29 +431,39 @@ impl Occupant for BilateralGrid {
     }
 
     fn tensors(&self) -> Vec<NamedTensor> {
-        let learnt = || self.views.iter().flatten();
-        let views = self.views.iter().enumerate().filter(|(_, learnt)| learnt.is_some());
+        let view_grid = || self.views.iter().flatten();
+        let views = self
+            .views
+            .iter()
+            .enumerate()
+            .filter(|(_, view_grid)| view_grid.is_some());
         let views: Vec<u64> = views.map(|(view, _)| view as u64).collect();
-        let planes = |name: &str, planes: fn(&Learnt) -> &Planes| {
-            let values: Vec<f32> = learnt().flat_map(|learnt| planes(learnt).as_slice()).copied().collect();
-            NamedTensor::real(name, vec![views.len(), CELLS, N], &values)
+        let planes = |name: &str, planes: fn(&ViewGrid) -> &Planes| {
+            let values: Vec<f32> = view_grid()
+                .flat_map(|view_grid| planes(view_grid).as_slice())
+                .copied()
+                .collect();
+            NamedTensor::f32s(name, vec![views.len(), CELLS, N], &values)
         };
         vec![
-            NamedTensor::real("mean", vec![CELLS, N], &self.mean),
-            planes("own", |learnt| &learnt.own),
-            planes("first_moments", |learnt| &learnt.moments[0]),
-            planes("second_moments", |learnt| &learnt.moments[1]),
-            NamedTensor::whole("steps", &learnt().map(|learnt| learnt.steps).collect::<Vec<_>>()),
-            NamedTensor::whole("views", &views),
+            NamedTensor::f32s("mean", vec![CELLS, N], &self.mean),
+            planes("own", |view_grid| &view_grid.own),
+            planes("first_moments", |view_grid| &view_grid.moments[0]),
+            planes("second_moments", |view_grid| &view_grid.moments[1]),
+            NamedTensor::u64s(
+                "steps",
+                &view_grid().map(|view_grid| view_grid.steps).collect::<Vec<_>>(),
+            ),
+            NamedTensor::u64s("views", &views),
         ]
     }
 
     fn restore(&mut self, tensors: TensorSource) -> Result<(), String> {
-        let views = tensors.whole("views").ok_or("views is missing")?;
-        let steps = tensors.whole("steps").filter(|steps| steps.len() == views.len());
+        let views = tensors.u64s("views").ok_or("views is missing")?;
+        let steps = tensors.u64s("steps").filter(|steps| steps.len() == views.len());
         let steps = steps.ok_or("steps is missing or has the wrong length")?;
         let reals = |name: &str, grids: usize| {
-            let values = tensors.real(name).filter(|values| values.len() == grids * CELLS * N);
+            let values = tensors.f32s(name).filter(|values| values.len() == grids * CELLS * N);
             values.ok_or(format!("{name} is missing or has the wrong length"))
         };
         self.mean = reals("mean", 1)?;
@@ -461,7 +476,7 @@ impl Occupant for BilateralGrid {
         for (i, (view, steps)) in views.iter().zip(steps).enumerate() {
             let plane = |values: &[f32]| Planes::from_interleaved(1, &values[i * CELLS * N..][..CELLS * N]);
             let place = self.views.get_mut(*view as usize);
-            *place.ok_or("views contains one that the dataset does not have")? = Some(Learnt {
+            *place.ok_or("views contains one that the dataset does not have")? = Some(ViewGrid {
                 own: plane(&own),
                 moments: [plane(&moments[0]), plane(&moments[1])],
                 steps,
@@ -474,10 +489,10 @@ impl Occupant for BilateralGrid {
     fn export(&self) -> Option<Vec<u8>> {
         let grids: Vec<f32> = self.train.iter().flat_map(|view| self.grid(*view)).collect();
         let views: Vec<u64> = self.train.iter().map(|view| *view as u64).collect();
-        let shape = vec![views.len(), SIZE[0], SIZE[1], SIZE[2], N];
+        let shape = vec![views.len(), GRID_SIZE[0], GRID_SIZE[1], GRID_SIZE[2], N];
         let tensors = [
-            NamedTensor::real("grids", shape, &grids),
-            NamedTensor::whole("views", &views),
+            NamedTensor::f32s("grids", shape, &grids),
+            NamedTensor::u64s("views", &views),
         ];
         Some(to_bytes(&tensors, ("irradia_bilateral", "1".into())))
     }
@@ -501,8 +516,8 @@ mod tests {
         for i in 0..PIXELS {
             loop {
                 let x = [0; 3].map(|_| rng.range(0.05, 0.6));
-                let t = (LUMA[0] * x[0] + LUMA[1] * x[1] + LUMA[2] * x[2]) * (SIZE[2] - 1) as f32;
-                if (t - t.round()).abs() > 2.0 * H * SIZE[2] as f32 {
+                let t = (LUMA[0] * x[0] + LUMA[1] * x[1] + LUMA[2] * x[2]) * (GRID_SIZE[2] - 1) as f32;
+                if (t - t.round()).abs() > 2.0 * H * GRID_SIZE[2] as f32 {
                     (color[i], color[PIXELS + i], color[2 * PIXELS + i]) = (x[0], x[1], x[2]);
                     break;
                 }
@@ -515,9 +530,9 @@ mod tests {
     fn example() -> (BilateralGrid, Vec<f32>, Vec<f32>) {
         let mut rng = Rng::new(3, 3);
         let mut grid = BilateralGrid::new(3, &[0, 1]);
-        let mut learnt = Learnt::new();
-        learnt.own.as_mut_slice().fill_with(|| rng.range(-0.1, 0.1));
-        grid.views[1] = Some(learnt);
+        let mut view_grid = ViewGrid::new();
+        view_grid.own.as_mut_slice().fill_with(|| rng.range(-0.1, 0.1));
+        grid.views[1] = Some(view_grid);
         let color = colors(&mut rng);
         let weights = (0..3 * PIXELS).map(|_| rng.range(-1.0, 1.0)).collect();
         (grid, color, weights)
@@ -585,16 +600,22 @@ mod tests {
     #[test]
     fn the_gradient_of_the_variation_agrees_with_finite_differences() {
         let variation = |grid: &[f32]| -> f64 {
-            let at =
-                |y: usize, x: usize, z: usize, i: usize| f64::from(grid[((y * SIZE[1] + x) * SIZE[2] + z) * N + i]);
+            let at = |y: usize, x: usize, z: usize, i: usize| {
+                f64::from(grid[((y * GRID_SIZE[1] + x) * GRID_SIZE[2] + z) * N + i])
+            };
             let (mut sums, mut pairs) = ([0.0; 3], [0.0; 3]);
             for (y, x, z, i) in (0..CELLS * N).map(|i| {
                 let cell = i / N;
-                (cell / ROW, cell / SIZE[2] % SIZE[1], cell % SIZE[2], i % N)
+                (
+                    cell / ROW_CELLS,
+                    cell / GRID_SIZE[2] % GRID_SIZE[1],
+                    cell % GRID_SIZE[2],
+                    i % N,
+                )
             }) {
                 let next = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
                 for (axis, [dy, dx, dz]) in next.into_iter().enumerate() {
-                    if y + dy < SIZE[0] && x + dx < SIZE[1] && z + dz < SIZE[2] {
+                    if y + dy < GRID_SIZE[0] && x + dx < GRID_SIZE[1] && z + dz < GRID_SIZE[2] {
                         sums[axis] += (at(y + dy, x + dx, z + dz, i) - at(y, x, z, i)).powi(2);
                         pairs[axis] += 1.0;
                     }
@@ -699,9 +720,9 @@ mod tests {
         let error = restored(&tensors[..5]).unwrap_err();
         assert!(error.contains("views"), "{error}");
         let mut elsewhere = tensors.clone();
-        elsewhere[5] = NamedTensor::whole("views", &[0, 7]);
+        elsewhere[5] = NamedTensor::u64s("views", &[0, 7]);
         assert!(restored(&elsewhere).is_err());
-        elsewhere[5] = NamedTensor::whole("views", &[0]);
+        elsewhere[5] = NamedTensor::u64s("views", &[0]);
         assert!(restored(&elsewhere).is_err());
     }
 }

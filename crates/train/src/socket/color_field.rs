@@ -40,7 +40,7 @@ impl ColorField {
     }
 
     /// The field, once trained.
-    pub fn learnt(&self) -> Option<&Field> {
+    pub fn trained_field(&self) -> Option<&Field> {
         (self.state.step > 0).then_some(&self.state.field)
     }
 
@@ -79,7 +79,7 @@ impl Occupant for ColorField {
     }
 
     fn export(&self) -> Option<Vec<u8>> {
-        self.learnt().map(field_file::to_bytes)
+        self.trained_field().map(field_file::to_bytes)
     }
 }
 

@@ -4,7 +4,7 @@
 //! 3 x 4 matrix): `y = A x + b` in the photograph's own, sRGB-encoded colours. Photographs saturate at 1, and so does `y`.
 
 use super::per_view::PerViewAdam;
-use super::{Occupant, pieces, sum_of};
+use super::{Occupant, pixel_chunks, sum_of};
 use crate::tensor_file::{NamedTensor, TensorSource, to_bytes};
 use irradia_measure::Affine;
 use rayon::prelude::*;
@@ -14,7 +14,7 @@ use safetensors::SafeTensors;
 const N: usize = 12;
 const IDENTITY: [f32; N] = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0];
 /// Pixels whose gradients are summed together: a fixed number, so that the sum does not depend on threads.
-const PIECE: usize = 4096;
+const PIXELS_PER_TASK: usize = 4096;
 
 /// An affine colour map per view, initially the identity. The mean over the training views stays the identity: a change common
 /// to all photographs belongs to the scene, which would otherwise drift to an exposure that no photograph has.
@@ -64,7 +64,7 @@ impl Exposure {
     /// One line, when it is damaged.
     pub(crate) fn from_file(bytes: &[u8]) -> Result<Self, String> {
         let file = SafeTensors::deserialize(bytes).map_err(|error| error.to_string())?;
-        let values = TensorSource::new(&file, "").real("maps");
+        let values = TensorSource::new(&file, "").f32s("maps");
         let values = values.filter(|values| values.len() % N == 0 && values.iter().all(|v| v.is_finite()));
         let maps = values.ok_or("maps is missing or has the wrong length")?;
         let mut exposure = Self::new(maps.len() / N, &[]);
@@ -103,12 +103,12 @@ impl Exposure {
     /// view's parameters. Where the output is saturated, only gradients that darken it pass.
     pub fn vjp(&self, view: usize, color: &[f32], v: &mut [f32]) -> [f32; N] {
         let (m, pixels) = (&self.maps[view], color.len() / 3);
-        let sums: Vec<[f64; N]> = pieces(v, PIECE)
+        let sums: Vec<[f64; N]> = pixel_chunks(v, PIXELS_PER_TASK)
             .enumerate()
             .map(|(piece, [red, green, blue])| {
                 let mut sum = [0.0f64; N];
                 for i in 0..red.len() {
-                    let at = piece * PIECE + i;
+                    let at = piece * PIXELS_PER_TASK + i;
                     let x = [color[at], color[pixels + at], color[2 * pixels + at]];
                     let mut v_y = [red[i], green[i], blue[i]];
                     for c in 0..3 {
@@ -159,7 +159,7 @@ impl Occupant for Exposure {
     }
 
     fn tensors(&self) -> Vec<NamedTensor> {
-        let maps = NamedTensor::real("maps", vec![self.maps.len(), N], self.maps.as_flattened());
+        let maps = NamedTensor::f32s("maps", vec![self.maps.len(), N], self.maps.as_flattened());
         std::iter::once(maps).chain(self.adam.tensors()).collect()
     }
 
@@ -169,7 +169,7 @@ impl Occupant for Exposure {
     }
 
     fn export(&self) -> Option<Vec<u8>> {
-        let maps = NamedTensor::real("maps", vec![self.maps.len(), N], self.maps.as_flattened());
+        let maps = NamedTensor::f32s("maps", vec![self.maps.len(), N], self.maps.as_flattened());
         Some(to_bytes(&[maps], ("irradia_exposure", "1".into())))
     }
 }

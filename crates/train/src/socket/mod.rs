@@ -53,18 +53,18 @@ pub const FILES: [&str; 7] = [
 ];
 
 /// The planes of `frame` `[3, H, W]` in pieces of `length` pixels, for all threads.
-fn pieces(frame: &mut [f32], length: usize) -> impl IndexedParallelIterator<Item = [&mut [f32]; 3]> {
+fn pixel_chunks(frame: &mut [f32], length: usize) -> impl IndexedParallelIterator<Item = [&mut [f32]; 3]> {
     let (red, rest) = frame.split_at_mut(frame.len() / 3);
     let (green, blue) = rest.split_at_mut(rest.len() / 2);
-    let pieces = red.par_chunks_mut(length).zip(green.par_chunks_mut(length));
-    let pieces = pieces.zip(blue.par_chunks_mut(length));
-    pieces.map(|((red, green), blue)| [red, green, blue])
+    let chunks = red.par_chunks_mut(length).zip(green.par_chunks_mut(length));
+    let chunks = chunks.zip(blue.par_chunks_mut(length));
+    chunks.map(|((red, green), blue)| [red, green, blue])
 }
 
 /// The sum of the gradients of all pieces, in their order.
-fn sum_of<const N: usize>(pieces: &[[f64; N]]) -> [f32; N] {
+fn sum_of<const N: usize>(chunks: &[[f64; N]]) -> [f32; N] {
     let mut total = [0.0f64; N];
-    for sum in pieces {
+    for sum in chunks {
         for (total, sum) in total.iter_mut().zip(sum) {
             *total += sum;
         }
@@ -202,17 +202,17 @@ impl Sockets {
     }
 
     /// Whether there are none: a step then trains only the splats.
-    pub fn are_empty(&self) -> bool {
-        self.poses.is_none() && !self.are_at_color() && !self.are_after_blending()
+    pub fn is_empty(&self) -> bool {
+        self.poses.is_none() && !self.any_at_color() && !self.any_after_blending()
     }
 
     /// Whether there are any at colour.
-    pub fn are_at_color(&self) -> bool {
+    pub fn any_at_color(&self) -> bool {
         self.residual.is_some() || self.appearance.is_some()
     }
 
     /// Whether there are any after blending.
-    pub fn are_after_blending(&self) -> bool {
+    pub fn any_after_blending(&self) -> bool {
         self.sky.is_some() || self.vignette.is_some() || self.exposure.is_some() || self.bilateral.is_some()
     }
 
@@ -246,8 +246,8 @@ impl Sockets {
             ..*options
         };
         let options = if self.sky.is_some() { &over_black } else { options };
-        let residual = self.residual.as_ref().filter(|residual| residual.acts(plan));
-        let appearance = self.appearance.as_ref().filter(|appearance| appearance.acts(plan));
+        let residual = self.residual.as_ref().filter(|residual| residual.is_active(plan));
+        let appearance = self.appearance.as_ref().filter(|appearance| appearance.is_active(plan));
         if residual.is_some() || appearance.is_some() {
             let center = placement.camera.pose.position;
             engine.project(placement, options);
@@ -260,7 +260,7 @@ impl Sockets {
         }
         let mut color = engine.frame().color;
         if let Some(sky) = &self.sky {
-            sky.put_behind(view, &camera, [color, engine.frame().alpha], &mut self.over_sky);
+            sky.composite_behind(view, &camera, [color, engine.frame().alpha], &mut self.over_sky);
             color = &self.over_sky;
         }
         if let Some(vignette) = &self.vignette {
@@ -340,8 +340,8 @@ impl Sockets {
         extent: f32,
         plan: &StepPlan,
     ) {
-        let residual = self.residual.as_mut().filter(|residual| residual.acts(plan));
-        let appearance = self.appearance.as_mut().filter(|appearance| appearance.acts(plan));
+        let residual = self.residual.as_mut().filter(|residual| residual.is_active(plan));
+        let appearance = self.appearance.as_mut().filter(|appearance| appearance.is_active(plan));
         if residual.is_some() || appearance.is_some() {
             let (surfaces, v_colors) = engine.color_gradients();
             let center = camera.pose.position;

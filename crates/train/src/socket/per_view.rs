@@ -69,9 +69,9 @@ impl<const N: usize> PerViewAdam<N> {
     pub fn tensors(&self) -> Vec<NamedTensor> {
         let [first, second] = &self.moments;
         vec![
-            NamedTensor::real("first_moments", vec![self.views(), N], &first.to_interleaved()),
-            NamedTensor::real("second_moments", vec![self.views(), N], &second.to_interleaved()),
-            NamedTensor::whole("steps", &self.steps),
+            NamedTensor::f32s("first_moments", vec![self.views(), N], &first.to_interleaved()),
+            NamedTensor::f32s("second_moments", vec![self.views(), N], &second.to_interleaved()),
+            NamedTensor::u64s("steps", &self.steps),
         ]
     }
 
@@ -86,7 +86,7 @@ impl<const N: usize> PerViewAdam<N> {
             *moment = Planes::from_interleaved(N, rows.as_flattened());
         }
         let name = format!("{prefix}steps");
-        let steps = tensors.whole(&name).filter(|steps| steps.len() == views);
+        let steps = tensors.u64s(&name).filter(|steps| steps.len() == views);
         self.steps = steps.ok_or(format!("{name} is missing or has the wrong length"))?;
         Ok(())
     }

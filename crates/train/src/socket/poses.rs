@@ -12,15 +12,15 @@ use irradia_scene::{Camera, Dataset, Pose};
 use irradia_splat::CameraGradient;
 
 /// Refined camera space from the dataset's: quaternion w, x, y, z and translation, world units.
-const NUMBERS: usize = 7;
-const IDENTITY: [f32; NUMBERS] = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
+const POSE_LEN: usize = 7;
+const IDENTITY: [f32; POSE_LEN] = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
 
 /// A correction of each view's pose, initially the identity. The motion common to all training views is removed from them,
 /// since it belongs to the scene: held-out cameras, which are not refined, keep their place in the scene.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PoseRefinement {
-    /// `[views][NUMBERS]`.
-    corrections: Vec<[f32; NUMBERS]>,
+    /// `[views][POSE_LEN]`.
+    corrections: Vec<[f32; POSE_LEN]>,
     /// The training views, with their cameras in the dataset.
     train: Vec<(usize, Camera)>,
     /// Adam on the tangent: rotation in radians, translation in world units.
@@ -40,7 +40,7 @@ impl PoseRefinement {
 
     /// The corrected camera of `view`.
     pub fn refined(&self, view: usize, camera: &Camera) -> Camera {
-        let (rotation, translation) = parts(&self.corrections[view]);
+        let (rotation, translation) = rotation_and_translation(&self.corrections[view]);
         moved(camera, rotation, translation)
     }
 
@@ -63,7 +63,7 @@ impl PoseRefinement {
 
     /// Appends a small motion in camera space to the correction of `view`.
     fn move_by(&mut self, view: usize, motion: Twist) {
-        let (rotation, translation) = parts(&self.corrections[view]);
+        let (rotation, translation) = rotation_and_translation(&self.corrections[view]);
         let turned = Quat::from_scaled_axis(motion.omega);
         let q = (turned * rotation).normalize();
         let t = turned * translation + motion.tau;
@@ -132,7 +132,7 @@ pub(crate) fn corrected(camera: &Camera, tangent: [f32; 6]) -> Camera {
     moved(camera, Quat::from_scaled_axis(omega), tau)
 }
 
-fn parts(correction: &[f32; NUMBERS]) -> (Quat, Vec3) {
+fn rotation_and_translation(correction: &[f32; POSE_LEN]) -> (Quat, Vec3) {
     let [w, x, y, z, tx, ty, tz] = *correction;
     (Quat::from_xyzw(x, y, z, w), Vec3::new(tx, ty, tz))
 }
@@ -157,18 +157,18 @@ impl Occupant for PoseRefinement {
 
     fn tensors(&self) -> Vec<NamedTensor> {
         let corrections = self.corrections.as_flattened();
-        let corrections = NamedTensor::real("corrections", vec![self.corrections.len(), NUMBERS], corrections);
+        let corrections = NamedTensor::f32s("corrections", vec![self.corrections.len(), POSE_LEN], corrections);
         std::iter::once(corrections).chain(self.adam.tensors()).collect()
     }
 
     fn restore(&mut self, tensors: TensorSource) -> Result<(), String> {
-        self.corrections = tensors.rows::<NUMBERS>("corrections", self.corrections.len())?;
+        self.corrections = tensors.rows::<POSE_LEN>("corrections", self.corrections.len())?;
         self.adam.restore(tensors, "")
     }
 
     fn export(&self) -> Option<Vec<u8>> {
         let corrections = self.corrections.as_flattened();
-        let corrections = NamedTensor::real("corrections", vec![self.corrections.len(), NUMBERS], corrections);
+        let corrections = NamedTensor::f32s("corrections", vec![self.corrections.len(), POSE_LEN], corrections);
         Some(to_bytes(&[corrections], ("irradia_poses", "1".into())))
     }
 }

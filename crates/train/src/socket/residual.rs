@@ -32,13 +32,13 @@ impl Residual {
     }
 
     /// Whether it adds to the frame of `plan`. Once it has begun it stays active.
-    pub fn acts(&self, plan: &StepPlan) -> bool {
-        plan.is_on(Param::Residual) || self.learnt().is_some()
+    pub fn is_active(&self, plan: &StepPlan) -> bool {
+        plan.is_on(Param::Residual) || self.trained_field().is_some()
     }
 
     /// The field, once trained.
-    pub fn learnt(&self) -> Option<&Field> {
-        self.0.learnt()
+    pub fn trained_field(&self) -> Option<&Field> {
+        self.0.trained_field()
     }
 
     /// Forward: the colours to add to `surfaces` seen from `center`.

@@ -7,7 +7,7 @@
 //! no alpha there.
 
 use super::per_view::PerViewAdam;
-use super::{Occupant, pieces};
+use super::{Occupant, pixel_chunks};
 use crate::tensor_file::{NamedTensor, TensorSource, to_bytes};
 use glam::{Vec2, Vec3};
 use irradia_scene::{Camera, Dataset};
@@ -19,9 +19,9 @@ const TERMS: usize = 4;
 /// Parameters of a sky: the terms of red, of green, of blue.
 const N: usize = 3 * TERMS;
 /// Distance between pixels whose viewing directions are computed; directions between them are interpolated.
-const SPACING: u32 = 8;
+const DIRECTION_SPACING: u32 = 8;
 /// Smallest cosine between two such directions for interpolation (26 degrees): they are further apart where a lens ends between them.
-const SMOOTH: f32 = 0.9;
+const MIN_COSINE: f32 = 0.9;
 /// The initial parameters of the common sky.
 const GREY: [f32; N] = [0.5, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0];
 /// Weight of the squared differences of a photograph's sky from the common one: a photograph that shows no sky has the common one.
@@ -51,17 +51,17 @@ fn color(sky: &[f32; N], direction: Vec3) -> [f32; 3] {
     std::array::from_fn(|c| (0..TERMS).map(|k| sky[TERMS * c + k] * terms[k]).sum())
 }
 
-/// Unit viewing directions, world, of the pixels of `row`. They are interpolated between every [`SPACING`]th pixel, since the inverse of a
-/// lens is slow; for a pinhole they are exact.
+/// Unit viewing directions, world, of the pixels of `row`. They are interpolated between every [`DIRECTION_SPACING`]th pixel, since the
+/// inverse of a lens is slow; for a pinhole they are exact.
 fn directions(camera: &Camera, row: usize) -> impl Iterator<Item = Vec3> {
     let (k, rotation) = (camera.intrinsics, camera.pose.rotation);
     let ray = move |column: u32| k.ray(Vec2::new(column as f32 + 0.5, row as f32 + 0.5));
-    (0..k.width.div_ceil(SPACING)).flat_map(move |piece| {
-        let first = piece * SPACING;
-        let (start, end) = (ray(first), ray(first + SPACING));
-        let is_smooth = start.normalize().dot(end.normalize()) > SMOOTH;
-        let step = (end - start) / SPACING as f32;
-        (0..SPACING.min(k.width - first)).map(move |i| {
+    (0..k.width.div_ceil(DIRECTION_SPACING)).flat_map(move |piece| {
+        let first = piece * DIRECTION_SPACING;
+        let (start, end) = (ray(first), ray(first + DIRECTION_SPACING));
+        let is_smooth = start.normalize().dot(end.normalize()) > MIN_COSINE;
+        let step = (end - start) / DIRECTION_SPACING as f32;
+        (0..DIRECTION_SPACING.min(k.width - first)).map(move |i| {
             let along = if is_smooth {
                 start + step * i as f32
             } else {
@@ -104,22 +104,24 @@ impl Sky {
     }
 
     /// Puts the sky of `view` behind `frame`: a colour `[3, H, W]` rendered over black, and its coverage `[H, W]`.
-    pub fn put_behind(&self, view: usize, camera: &Camera, frame: [&[f32]; 2], to: &mut Vec<f32>) {
+    pub fn composite_behind(&self, view: usize, camera: &Camera, frame: [&[f32]; 2], to: &mut Vec<f32>) {
         let ([from, alpha], sky) = (frame, self.of(view));
         let (width, pixels) = (camera.intrinsics.width as usize, alpha.len());
         to.resize(from.len(), 0.0);
-        pieces(to, width).enumerate().for_each(|(row, [red, green, blue])| {
-            for (x, direction) in directions(camera, row).enumerate() {
-                let at = row * width + x;
-                let (behind, left) = (color(&sky, direction), 1.0 - alpha[at]);
-                red[x] = from[at] + left * behind[0];
-                green[x] = from[pixels + at] + left * behind[1];
-                blue[x] = from[2 * pixels + at] + left * behind[2];
-            }
-        });
+        pixel_chunks(to, width)
+            .enumerate()
+            .for_each(|(row, [red, green, blue])| {
+                for (x, direction) in directions(camera, row).enumerate() {
+                    let at = row * width + x;
+                    let (behind, left) = (color(&sky, direction), 1.0 - alpha[at]);
+                    red[x] = from[at] + left * behind[0];
+                    green[x] = from[pixels + at] + left * behind[1];
+                    blue[x] = from[2 * pixels + at] + left * behind[2];
+                }
+            });
     }
 
-    /// The vector-Jacobian product of [`Self::put_behind`]: adds the gradient of `alpha` to `v_alpha`, and returns that of the view's
+    /// The vector-Jacobian product of [`Self::composite_behind`]: adds the gradient of `alpha` to `v_alpha`, and returns that of the view's
     /// colours; that of `color` is `v` itself.
     pub fn vjp(&self, view: usize, camera: &Camera, alpha: &[f32], v: &[f32], v_alpha: &mut [f32]) -> [f32; N] {
         let (sky, pixels) = (self.of(view), alpha.len());
@@ -167,7 +169,7 @@ impl Sky {
 /// One line, if it is not such a file.
 pub fn background_of_sky(file: &[u8]) -> Result<[f32; 3], String> {
     let file = SafeTensors::deserialize(file).map_err(|error| error.to_string())?;
-    let found = TensorSource::new(&file, "").real("background");
+    let found = TensorSource::new(&file, "").f32s("background");
     let color: Option<[f32; 3]> = found.and_then(|values| values.try_into().ok());
     let valid = color.filter(|color| color.iter().all(|v| (0.0..=1.0).contains(v)));
     valid.ok_or_else(|| "background is missing or not a colour".into())
@@ -180,8 +182,8 @@ impl Occupant for Sky {
 
     fn tensors(&self) -> Vec<NamedTensor> {
         let colors = [
-            NamedTensor::real("common", vec![1, N], &self.common),
-            NamedTensor::real("own", vec![self.own.len(), N], self.own.as_flattened()),
+            NamedTensor::f32s("common", vec![1, N], &self.common),
+            NamedTensor::f32s("own", vec![self.own.len(), N], self.own.as_flattened()),
         ];
         let common = self.common_adam.tensors().into_iter().map(|t| t.prefixed("common_"));
         let own = self.own_adam.tensors().into_iter().map(|t| t.prefixed("own_"));
@@ -199,9 +201,9 @@ impl Occupant for Sky {
 
     fn export(&self) -> Option<Vec<u8>> {
         let tensors = [
-            NamedTensor::real("background", vec![3], &self.background()),
-            NamedTensor::real("common", vec![1, N], &self.common),
-            NamedTensor::real("own", vec![self.own.len(), N], self.own.as_flattened()),
+            NamedTensor::f32s("background", vec![3], &self.background()),
+            NamedTensor::f32s("common", vec![1, N], &self.common),
+            NamedTensor::f32s("own", vec![self.own.len(), N], self.own.as_flattened()),
         ];
         Some(to_bytes(&tensors, ("irradia_sky", "1".into())))
     }
@@ -212,7 +214,7 @@ mod tests {
     use super::*;
     use glam::Quat;
     use irradia_scene::{Intrinsics, Lens, Pose, Rng};
-    use irradia_testkit::differences::Differences;
+    use irradia_testkit::finite_differences::FiniteDifferences;
     use std::f32::consts::TAU;
 
     const SIZE: [u32; 2] = [9, 7];
@@ -284,7 +286,7 @@ mod tests {
 
     fn loss(sky: &Sky, color: &[f32], alpha: &[f32], weights: &[f32]) -> f64 {
         let mut over = Vec::new();
-        sky.put_behind(1, &camera(), [color, alpha], &mut over);
+        sky.composite_behind(1, &camera(), [color, alpha], &mut over);
         over.iter()
             .zip(weights)
             .map(|(y, w)| f64::from(*y) * f64::from(*w))
@@ -297,10 +299,10 @@ mod tests {
         let mut v_alpha = vec![0.0; PIXELS];
         let of_sky = sky.vjp(1, &camera(), &alpha, &weights, &mut v_alpha);
         // Linear in all of them: a large step costs only rounding.
-        let within = |absolute| Differences {
+        let within = |absolute| FiniteDifferences {
             step: 1e-1,
             relative: 0.0,
-            of_largest: 0.0,
+            relative_to_max: 0.0,
             absolute,
         };
         let own = sky.own[1].map(f64::from);
@@ -329,7 +331,7 @@ mod tests {
             let rate = if step < 300 { 0.03 } else { 0.002 };
             for view in 0..3 {
                 let (mut over, mut v_alpha) = (Vec::new(), vec![0.0; PIXELS]);
-                sky.put_behind(view, &camera(), [&color, &alphas[view]], &mut over);
+                sky.composite_behind(view, &camera(), [&color, &alphas[view]], &mut over);
                 let left = 1.0 - alphas[view][0];
                 let v: Vec<f32> = over
                     .iter()
@@ -365,7 +367,7 @@ mod tests {
         }
         assert!(background_of_sky(b"{}").is_err());
         let without = to_bytes(
-            &[NamedTensor::real("background", vec![2], &[0.0; 2])],
+            &[NamedTensor::f32s("background", vec![2], &[0.0; 2])],
             ("x", "1".into()),
         );
         assert!(background_of_sky(&without).unwrap_err().contains("background"));

@@ -6,7 +6,7 @@
 //! vignette belongs to the lens, not to a photograph: held-out views have it as well.
 
 use super::per_view::PerViewAdam;
-use super::{Occupant, pieces, sum_of};
+use super::{Occupant, pixel_chunks, sum_of};
 use crate::tensor_file::{NamedTensor, TensorSource, to_bytes};
 use irradia_scene::{Dataset, Image, Intrinsics};
 use rayon::prelude::*;
@@ -15,11 +15,11 @@ use safetensors::SafeTensors;
 /// Parameters of a lens: a, b, c.
 const N: usize = 3;
 /// Maximum relative difference of proportions, and of focal lengths, between images by the same lens.
-const SAME: f32 = 0.03;
+const LENS_TOLERANCE: f32 = 0.03;
 /// The minimum gain.
 const MIN_GAIN: f32 = 0.05;
 /// Rows whose gradients are summed together: a fixed number, so that the sum does not depend on threads.
-const ROWS: usize = 16;
+const ROWS_PER_TASK: usize = 16;
 
 /// The properties by which lenses are told apart, independent of the image's size and orientation.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -39,13 +39,13 @@ impl Lens {
         }
     }
 
-    fn is_like(self, other: Self) -> bool {
-        let near = |a: f32, b: f32| (a - b).abs() <= SAME * a;
+    fn matches(self, other: Self) -> bool {
+        let near = |a: f32, b: f32| (a - b).abs() <= LENS_TOLERANCE * a;
         near(self.proportion, other.proportion) && near(self.focal, other.focal)
     }
 
     /// Whether the image is the face of a cube, whose corners are not those of a lens.
-    fn is_face(self) -> bool {
+    fn is_cube_face(self) -> bool {
         self.proportion == 1.0 && (self.focal - 0.5).abs() < 1e-3
     }
 }
@@ -65,7 +65,7 @@ impl Vignette {
         let mut lenses: Vec<Lens> = Vec::new();
         for view in &dataset.train {
             let lens = Lens::of(&dataset.views[*view].camera.intrinsics);
-            if !lens.is_face() && !lenses.iter().any(|other| other.is_like(lens)) {
+            if !lens.is_cube_face() && !lenses.iter().any(|other| other.matches(lens)) {
                 lenses.push(lens);
             }
         }
@@ -87,7 +87,7 @@ impl Vignette {
     pub fn from_file(bytes: &[u8]) -> Result<Self, String> {
         let file = SafeTensors::deserialize(bytes).map_err(|error| error.to_string())?;
         let read = |name: &str, each: usize| {
-            let values = TensorSource::new(&file, "").real(name);
+            let values = TensorSource::new(&file, "").f32s(name);
             let values = values.filter(|values| values.len() % each == 0 && values.iter().all(|v| v.is_finite()));
             values.ok_or(format!("{name} is missing or has the wrong length"))
         };
@@ -105,20 +105,20 @@ impl Vignette {
     }
 
     /// The gain at the corners of the lens that changes them most, in sRGB-encoded colours; `None` before the first step.
-    pub fn corner(&self) -> Option<f32> {
+    pub fn corner_gain(&self) -> Option<f32> {
         let trained = self.curves.iter().filter(|curve| **curve != [0.0; N]);
-        let change = |corner: f32| (corner - 1.0).abs();
+        let change = |corner_gain: f32| (corner_gain - 1.0).abs();
         let corners = trained.map(|curve| gain(*curve, 1.0));
         corners.max_by(|a, b| change(*a).total_cmp(&change(*b)))
     }
 
     fn curves(&self) -> NamedTensor {
-        NamedTensor::real("curves", vec![self.curves.len(), N], self.curves.as_flattened())
+        NamedTensor::f32s("curves", vec![self.curves.len(), N], self.curves.as_flattened())
     }
 
     fn lens_of(&self, k: &Intrinsics) -> Option<usize> {
         let lens = Lens::of(k);
-        self.lenses.iter().position(|other| other.is_like(lens))
+        self.lenses.iter().position(|other| other.matches(lens))
     }
 
     /// `color` `[3, H, W]` as the lens of `k` shows it, at most 1; unchanged if the lens is unknown.
@@ -129,15 +129,17 @@ impl Vignette {
             return;
         };
         let (curve, width) = (self.curves[lens], k.width as usize);
-        pieces(to, ROWS * width).enumerate().for_each(|(piece, planes)| {
-            for plane in planes {
-                for (row, values) in plane.chunks_mut(width).enumerate() {
-                    for (value, u) in values.iter_mut().zip(radii(k, piece * ROWS + row)) {
-                        *value = seen(*value, gain(curve, u));
+        pixel_chunks(to, ROWS_PER_TASK * width)
+            .enumerate()
+            .for_each(|(piece, planes)| {
+                for plane in planes {
+                    for (row, values) in plane.chunks_mut(width).enumerate() {
+                        for (value, u) in values.iter_mut().zip(squared_radii(k, piece * ROWS_PER_TASK + row)) {
+                            *value = apply_gain(*value, gain(curve, u));
+                        }
                     }
                 }
-            }
-        });
+            });
     }
 
     /// `image` `[H, W, 3]` as the lens of `k` shows it, as [`Self::develop`] does with planes.
@@ -145,8 +147,8 @@ impl Vignette {
         if let Some(lens) = self.lens_of(k) {
             let curve = self.curves[lens];
             for (row, values) in image.data.chunks_mut(3 * k.width as usize).enumerate() {
-                for (pixel, u) in values.as_chunks_mut::<3>().0.iter_mut().zip(radii(k, row)) {
-                    *pixel = pixel.map(|value| seen(value, gain(curve, u)));
+                for (pixel, u) in values.as_chunks_mut::<3>().0.iter_mut().zip(squared_radii(k, row)) {
+                    *pixel = pixel.map(|value| apply_gain(value, gain(curve, u)));
                 }
             }
         }
@@ -158,16 +160,16 @@ impl Vignette {
     fn vjp(&self, lens: usize, k: &Intrinsics, color: &[f32], v: &mut [f32]) -> [f32; N] {
         let (curve, width) = (self.curves[lens], k.width as usize);
         let pixels = color.len() / 3;
-        let sums: Vec<[f64; N]> = pieces(v, ROWS * width)
+        let sums: Vec<[f64; N]> = pixel_chunks(v, ROWS_PER_TASK * width)
             .enumerate()
             .map(|(piece, planes)| {
                 let mut total = [0.0f64; N];
                 for (c, plane) in planes.into_iter().enumerate() {
                     for (row, v) in plane.chunks_mut(width).enumerate() {
-                        let row = piece * ROWS + row;
+                        let row = piece * ROWS_PER_TASK + row;
                         let color = &color[c * pixels + row * width..][..width];
                         let mut sum = [0.0f32; N];
-                        for ((v, x), u) in v.iter_mut().zip(color).zip(radii(k, row)) {
+                        for ((v, x), u) in v.iter_mut().zip(color).zip(squared_radii(k, row)) {
                             let gain = gain(curve, u);
                             let v_y = if x * gain > 1.0 { v.max(0.0) } else { *v };
                             let v_gain = if gain > MIN_GAIN { v_y * x } else { 0.0 };
@@ -206,12 +208,12 @@ fn gain([a, b, c]: [f32; N], u: f32) -> f32 {
 }
 
 /// `value` as the photograph shows it where the gain is `gain`.
-fn seen(value: f32, gain: f32) -> f32 {
+fn apply_gain(value: f32, gain: f32) -> f32 {
     (value * gain).min(1.0)
 }
 
 /// Squared distances of the pixels of `row` from the principal point, 1 at half a diagonal.
-fn radii(k: &Intrinsics, row: usize) -> impl Iterator<Item = f32> {
+fn squared_radii(k: &Intrinsics, row: usize) -> impl Iterator<Item = f32> {
     let unit = 4.0 / (k.width as f32 * k.width as f32 + k.height as f32 * k.height as f32);
     let (dy, cx) = (row as f32 + 0.5 - k.cy, k.cx);
     (0..k.width).map(move |x| {
@@ -240,7 +242,7 @@ impl Occupant for Vignette {
             .iter()
             .flat_map(|lens| [lens.proportion, lens.focal])
             .collect();
-        let lenses = NamedTensor::real("lenses", vec![self.lenses.len(), 2], &lenses);
+        let lenses = NamedTensor::f32s("lenses", vec![self.lenses.len(), 2], &lenses);
         Some(to_bytes(&[lenses, self.curves()], ("irradia_vignette", "1".into())))
     }
 }
@@ -292,7 +294,7 @@ mod tests {
     #[test]
     fn corners_darken_and_the_principal_point_stays() {
         let mut vignette = Vignette::new(&dataset(&[(9, 5, 1.0)])).unwrap();
-        assert_eq!(vignette.corner(), None);
+        assert_eq!(vignette.corner_gain(), None);
         let mut k = Intrinsics::from_fov_x(9, 5, 1.0);
         (k.fx, k.fy) = (9.0, 9.0);
         vignette.curves[0] = [-0.1, -0.1, -0.1];
@@ -304,7 +306,7 @@ mod tests {
         let u = (16.0 + 4.0) / (4.5f32 * 4.5 + 2.5 * 2.5);
         let expected = 0.5 * (1.0 - 0.1 * (u + u * u + u * u * u));
         assert!((y[0] - expected).abs() < 1e-6 && (y[134] - expected).abs() < 1e-6);
-        assert!((vignette.corner().unwrap() - 0.7).abs() < 1e-6);
+        assert!((vignette.corner_gain().unwrap() - 0.7).abs() < 1e-6);
         vignette.develop(&k.resized(9, 9), &[0.5; 243], &mut y);
         assert_eq!(y, [0.5; 243], "another lens");
     }
@@ -387,8 +389,8 @@ mod tests {
         for end in [0, 8, file.len() / 2, file.len() - 1] {
             assert!(Vignette::from_file(&file[..end]).is_err());
         }
-        let lenses = NamedTensor::real("lenses", vec![2, 2], &[1.0; 4]);
-        let curves = NamedTensor::real("curves", vec![1, N], &[0.0; N]);
+        let lenses = NamedTensor::f32s("lenses", vec![2, 2], &[1.0; 4]);
+        let curves = NamedTensor::f32s("curves", vec![1, N], &[0.0; N]);
         let error = Vignette::from_file(&to_bytes(&[lenses, curves], ("irradia_vignette", "1".into()))).unwrap_err();
         assert_eq!(error, "2 lenses, 1 curves");
     }

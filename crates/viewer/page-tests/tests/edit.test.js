@@ -2,9 +2,9 @@
 
 import assert from "node:assert/strict";
 import { join } from "node:path";
-import { cpSync, existsSync, readFileSync, readdirSync } from "node:fs";
+import { cpSync, existsSync, readFileSync, readdirSync, writeFileSync } from "node:fs";
 import { after, before, test } from "node:test";
-import { OUT, browse, get, open, picture, pretendGpu, psnr, run, scratch, serve, set, sharp, stopAll, until } from "./harness.js";
+import { OUT, browse, get, open, picture, pretendGpu, psnr, readPng, run, scratch, serve, set, sharp, stopAll, until } from "./harness.js";
 import { dataset, trained } from "./scenes.js";
 
 /** @type {import("playwright-core").Browser} */
@@ -269,6 +269,53 @@ test("turning the scene upright keeps the picture, and views stay in place", asy
   await edited(page, (e) => e.at === 0);
   assert.ok(psnr(opened, await picture(page)) > 60);
   assert.deepEqual(problems, []);
+  await server.stop();
+});
+
+test("a saved camera path and the side seen first are those of the scene, however it is turned", async () => {
+  const scene = copy("followed");
+  const size = { width: 800, height: 560 };
+  const server = await serve("view", scene, "--port", "0");
+  const { page, problems } = await open(browser, server.address, size);
+  await set(page, { drawing: "served", axes: false, tab: "edit", sidebar: true });
+  await page.evaluate(async () => {
+    const [{ path }, { state }] = [await import("/page/js/path.js"), await import("/page/js/state.js")];
+    path.add(state.get("camera"));
+  });
+  const near = (a, b) => a.length > 0 && a.every((v, i) => Math.abs(v - b[i]) < 1e-3);
+  const save = () => page.evaluate(async () => JSON.parse(JSON.stringify((await import("/page/js/path.js")).path)));
+  const saved = await save();
+  const opened = (await get(page, "camera")).position;
+  await page.getByRole("button", { name: "This view's up" }).click();
+  await edited(page, (e) => e.at === 1);
+  const turned = (await get(page, "camera")).position;
+  assert.ok(!near(turned, opened));
+  assert.ok(near((await save()).keys[0].position, saved.keys[0].position), "the file is the same");
+  const read = await page.evaluate(async (saved) => {
+    const { path } = await import("/page/js/path.js");
+    path.read(saved);
+    return path.keys[0].position;
+  }, saved);
+  assert.ok(near(read, turned), "a file from before the turn fits");
+
+  const late = await open(browser, server.address, size);
+  assert.ok(near((await get(late.page, "camera")).position, turned), "a new page begins on the same side");
+  await page.getByRole("button", { name: "Save" }).click();
+  await edited(page, (e) => Boolean(e.saved));
+  const again = await serve("view", join(scene, "scene.edited.ply"), "--port", "0");
+  const other = await open(browser, again.address, size);
+  assert.ok(near((await get(other.page, "camera")).position, turned), "so does a page on the saved scene");
+  await again.stop();
+
+  const file = join(scratch, "followed.json");
+  writeFileSync(file, JSON.stringify(saved));
+  const [before, after] = ["scene.ply", "scene.edited.ply"].map((name, i) => {
+    const out = join(scratch, `followed_${i}`);
+    run("render", join(scene, name), "--path", file, "--size", "160x120", "--out", out);
+    return readPng(join(out, "frame_0000.png"));
+  });
+  assert.ok(psnr(before, after) > 40);
+  assert.deepEqual([...problems, ...late.problems, ...other.problems], []);
   await server.stop();
 });
 

@@ -87,6 +87,31 @@ test("views, comparison, tools and modes", async () => {
   await server.stop();
 });
 
+test("the list of views stays where it is while scores arrive", async () => {
+  const server = await serve("view", trained(), "--port", "0");
+  const { page, problems } = await open(browser, server.address, { width: 900, height: 400 });
+  await page.getByRole("tab", { name: "Views" }).click();
+  await page.getByRole("button", { name: "Worst first" }).click();
+  const seen = await page.evaluate(async () => {
+    const { state } = await import("/page/js/state.js");
+    const pane = document.querySelector("irr-sidebar .pane");
+    const entry = /** @type {HTMLElement} */ (document.querySelectorAll(".views button")[20]);
+    const others = state.get("views").map((_, view) => [view, 30]).filter(([view]) => view !== 20);
+    // The view that the camera is in is at the top of the list.
+    state.set({ view: 0, scores: new Map(others) });
+    entry.focus();
+    pane.scrollTop = pane.scrollHeight;
+    const top = pane.scrollTop;
+    state.set({ scores: new Map([...others, [20, 10]]) });
+    const first = document.querySelector(".views button");
+    return { top, after: pane.scrollTop, focused: document.activeElement === entry, sorted: first === entry, text: entry.lastElementChild.textContent };
+  });
+  assert.ok(seen.top > 0);
+  assert.deepEqual(seen, { top: seen.top, after: seen.top, focused: true, sorted: true, text: "10.00" });
+  assert.deepEqual(problems, []);
+  await server.stop();
+});
+
 test("a scene is shown in the light of one of its photographs", async () => {
   const dark = 3;
   const server = await serve("view", lit(27, dark), "--port", "0");

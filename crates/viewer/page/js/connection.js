@@ -6,13 +6,13 @@ import { state } from "./state.js";
  *   range?: [number, number] }} Header */
 
 /** Milliseconds until the next attempt to connect: the first wait, doubled up to the last one. */
-const FIRST_WAIT = 250;
-const LAST_WAIT = 4000;
+const MIN_WAIT = 250;
+const MAX_WAIT = 4000;
 
 class Connection extends EventTarget {
   /** @type {WebSocket | null} */
   socket = null;
-  wait = FIRST_WAIT;
+  wait = MIN_WAIT;
   /** @type {Map<string, (answer: any) => void>} */
   awaited = new Map();
   tags = 0;
@@ -22,7 +22,7 @@ class Connection extends EventTarget {
     socket.binaryType = "arraybuffer";
     socket.onmessage = (event) => this.receive(event.data);
     socket.onopen = () => {
-      this.wait = FIRST_WAIT;
+      this.wait = MIN_WAIT;
       state.set({ connection: "open" });
       this.dispatchEvent(new Event("open"));
     };
@@ -31,7 +31,7 @@ class Connection extends EventTarget {
       const full = event.code === 1013;
       state.set({ connection: full ? "full" : "lost" });
       setTimeout(() => this.open(), this.wait);
-      this.wait = Math.min(2 * this.wait, LAST_WAIT);
+      this.wait = Math.min(2 * this.wait, MAX_WAIT);
     };
     this.socket = socket;
   }

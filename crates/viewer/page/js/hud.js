@@ -15,7 +15,7 @@ const RAMPS = {
 };
 
 /** Milliseconds for which a message is shown. */
-const MESSAGE = 5000;
+const MESSAGE_TIMEOUT = 5000;
 
 class Hud extends HTMLElement {
   connectedCallback() {
@@ -65,7 +65,7 @@ class Hud extends HTMLElement {
       this.hiding = setTimeout(() => {
         message.hidden = true;
         state.set({ problem: null });
-      }, MESSAGE);
+      }, MESSAGE_TIMEOUT);
     });
   }
 

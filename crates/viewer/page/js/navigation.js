@@ -10,11 +10,11 @@ import { state } from "./state.js";
 /** @typedef {import("./math.js").Vec3} Vec3 */
 
 /** Radians per pixel of dragging. */
-const TURN = 0.006;
+const RADIANS_PER_PIXEL = 0.006;
 /** Largest angle between the view and the horizon, radians: short of the poles. */
-const STEEPEST = 1.54;
+const MAX_ELEVATION = 1.54;
 /** Seconds of a flight from one camera to another. */
-const FLIGHT = 0.45;
+const FLIGHT_SECONDS = 0.45;
 /** Keys that move, with the camera axes they move along. @type {Record<string, Vec3>} */
 export const MOVES = {
   KeyW: [0, 0, 1], KeyS: [0, 0, -1], KeyA: [-1, 0, 0], KeyD: [1, 0, 0], KeyQ: [0, 1, 0], KeyE: [0, -1, 0],
@@ -115,13 +115,13 @@ export class Navigation {
     const up = state.get("up");
     const orbits = state.get("navigation") === "orbit";
     const sign = orbits ? 1 : -1;
-    const gain = orbits ? TURN : TURN * 0.6;
+    const gain = orbits ? RADIANS_PER_PIXEL : RADIANS_PER_PIXEL * 0.6;
     // Yaw about the up axis, then pitch about the camera's own right axis.
     const yaw = turn(up, -sign * dx * gain);
     const [right, , ahead] = axes(camera.rotation);
     const elevation = Math.asin(clamp(dot(ahead, up), -1, 1));
     // A positive turn about the right axis raises the view.
-    const [lowest, highest] = [Math.min(0, -STEEPEST - elevation), Math.max(0, STEEPEST - elevation)];
+    const [lowest, highest] = [Math.min(0, -MAX_ELEVATION - elevation), Math.max(0, MAX_ELEVATION - elevation)];
     const both = multiply(yaw, turn(right, clamp(-sign * dy * gain, lowest, highest)));
     const rotation = unit(multiply(both, camera.rotation));
     if (!orbits) return this.place({ rotation });
@@ -212,7 +212,7 @@ export class Navigation {
   fly(now) {
     const flight = this.flight;
     if (!flight) return;
-    const t = clamp((now - flight.at) / 1000 / FLIGHT, 0, 1);
+    const t = clamp((now - flight.at) / 1000 / FLIGHT_SECONDS, 0, 1);
     if (t >= 1) {
       this.flight = null;
       state.set({ camera: flight.to, view: flight.view, ...(flight.pivot && { pivot: flight.pivot }) });
@@ -272,11 +272,10 @@ export class Navigation {
 /** The camera that shows the whole scene. @returns {{ camera: Camera, pivot: Vec3 }} */
 export function homeOf() {
   const scene = state.get("scene");
-  const views = state.get("views");
   const up = scene?.up ?? [0, -1, 0];
   const pivot = scene?.center ?? [0, 0, 0];
   const fov = clamp(scene?.fov ?? 0.9, 0.2, 1.6);
-  const first = views[0]?.position ?? add(pivot, cross(up, normalize([0.3, 0.2, 0.9])));
+  const first = scene?.first ?? state.get("views")[0]?.position ?? add(pivot, cross(up, normalize([0.3, 0.2, 0.9])));
   const offset = subtract(first, pivot);
   const flat = normalize(subtract(offset, scale(up, dot(offset, up))));
   const radius = scene?.radius ?? 3;

@@ -15,20 +15,20 @@ export const AXIS_COLORS = ["#e5736f", "#6cc08b", "#6ea8fe"];
 export const EDGES = [[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]];
 
 /** Size of a drawn camera, as a share of the scene's radius. */
-const FRUSTUM = 0.09;
+const FRUSTUM_SIZE = 0.09;
 /** Depth at which lines are cut off, as a share of the scene's radius. */
-const NEAR = 0.01;
+const NEAR_DEPTH = 0.01;
 
 /** @param {CanvasRenderingContext2D} context in the picture's pixels @param {Camera} camera @param {Intrinsics} k
  * @param {number} pixel the picture's pixels per CSS pixel */
 export function drawOverlay(context, camera, k, pixel) {
   const scene = state.get("scene");
   const size = scene?.radius ?? 1;
-  const draw = { context, camera, k, near: NEAR * size };
+  const draw = { context, camera, k, near: NEAR_DEPTH * size };
   context.lineWidth = pixel;
   const inside = state.get("view");
   for (const { view, index } of seenFrusta(camera)) {
-    drawFrustum(draw, view, FRUSTUM * size, colorOf(view.trained, state.get("scores").get(index)), view.photo ? thumbnails.get(index) : null);
+    drawFrustum(draw, view, FRUSTUM_SIZE * size, colorOf(view.trained, state.get("scores").get(index)), view.photo ? thumbnails.get(index) : null);
   }
   if (state.get("axes") && inside === null && !(state.get("tab") === "edit" && state.get("editing")?.selected)) {
     const pivot = state.get("pivot");
@@ -57,7 +57,7 @@ export function drawOverlay(context, camera, k, pixel) {
  * @param {Camera} camera */
 function seenFrusta(camera) {
   if (!state.get("frusta") || state.get("compare") !== "none") return [];
-  const near = 1.5 * FRUSTUM * (state.get("scene")?.radius ?? 1);
+  const near = 1.5 * FRUSTUM_SIZE * (state.get("scene")?.radius ?? 1);
   const all = state.get("views").map((view, index) => ({ view, index, apart: length(subtract(view.position, camera.position)) }));
   return all.filter(({ apart }) => apart > near).sort((a, b) => b.apart - a.apart);
 }
@@ -65,7 +65,7 @@ function seenFrusta(camera) {
 /** The camera drawn nearest to a point of the picture, within a few pixels of it.
  * @param {Camera} camera @param {Intrinsics} k @param {number} x @param {number} y @param {number} within @returns {number | null} */
 export function frustumAt(camera, k, x, y, within) {
-  const size = FRUSTUM * (state.get("scene")?.radius ?? 1);
+  const size = FRUSTUM_SIZE * (state.get("scene")?.radius ?? 1);
   let best = null;
   for (const { view, index } of seenFrusta(camera)) {
     const middle = add(view.position, scale(axes(view.rotation)[2], 0.7 * size));

@@ -4,6 +4,8 @@
 // rotations are interpolated by squad (Shoemake 1987): slerp of slerps with inner quaternions.
 
 import { clamp, multiply, slerp, unit } from "./math.js";
+import { REST, between, placedCamera } from "./similarity.js";
+import { state } from "./state.js";
 
 /** @typedef {import("./math.js").Vec3} Vec3 */
 /** @typedef {import("./math.js").Quat} Quat */
@@ -11,7 +13,7 @@ import { clamp, multiply, slerp, unit } from "./math.js";
 /** @typedef {{ time: number, position: Vec3, rotation: Quat, fov: number }} Key */
 
 /** Initial time between key frames, seconds. */
-export const APART = 2;
+export const KEY_INTERVAL = 2;
 
 /** @param {Quat} q @returns {Quat} */
 const conjugate = ([w, x, y, z]) => [w, -x, -y, -z];
@@ -33,6 +35,9 @@ function exp(v) {
 
 /** @param {Quat} a @param {Quat} b the same rotation as b, on the side of a @returns {Quat} */
 const near = (a, b) => (a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] < 0 ? [-b[0], -b[1], -b[2], -b[3]] : b);
+
+/** From the coordinates of the photographs, in which paths are saved, to the world: a path fits the scene however it has been moved. */
+const worldFromPhotographs = () => state.get("scene")?.world_from_photographs ?? REST;
 
 /** @param {number} t eased in and out: the smooth step of degree 3 */
 const eased = (t) => t * t * (3 - 2 * t);
@@ -56,7 +61,7 @@ class Path extends EventTarget {
   /** Adds a camera as the last key frame. @param {Camera} camera */
   add({ position, rotation, fov }) {
     const last = this.keys[this.keys.length - 1];
-    this.keys.push({ time: last ? last.time + APART : 0, position, rotation, fov });
+    this.keys.push({ time: last ? last.time + KEY_INTERVAL : 0, position, rotation, fov });
     this.changed();
   }
 
@@ -111,7 +116,9 @@ class Path extends EventTarget {
 
   /** The format that is saved, and read by irradia render --path. */
   toJSON() {
-    return { irradia_path: 1, fps: this.fps, loop: this.loop, ease: this.ease, closing: this.closing, keys: this.keys };
+    const photographsFromWorld = between(worldFromPhotographs(), REST);
+    const keys = this.keys.map((key) => placedCamera(photographsFromWorld, key));
+    return { irradia_path: 1, fps: this.fps, loop: this.loop, ease: this.ease, closing: this.closing, keys };
   }
 
   /** Reads what toJSON wrote. @param {any} saved */
@@ -120,7 +127,8 @@ class Path extends EventTarget {
       [key?.time, key?.fov, ...(key?.position ?? [null]), ...(key?.rotation ?? [null])].every(Number.isFinite) &&
       key.position.length === 3 && key.rotation.length === 4;
     if (saved?.irradia_path !== 1 || !Array.isArray(saved.keys) || !saved.keys.every(fits)) throw new Error("This is not a camera path of Irradia");
-    this.keys = saved.keys.map((/** @type {Key} */ { time, position, rotation, fov }) => ({ time, position, rotation, fov }));
+    const world = worldFromPhotographs();
+    this.keys = saved.keys.map((/** @type {Key} */ { time, position, rotation, fov }) => placedCamera(world, { time, position, rotation, fov }));
     this.keys.sort((a, b) => a.time - b.time);
     [this.fps, this.loop, this.ease, this.closing] = [saved.fps ?? 30, Boolean(saved.loop), Boolean(saved.ease), saved.closing ?? 2];
     this.changed();

@@ -19,17 +19,17 @@ import { state } from "./state.js";
 /** Modes that the page can draw locally. */
 export const LOCAL_MODES = ["color", "ellipses", "rings", "points"];
 /** Number of splats beyond which the server draws, unless the user chooses otherwise. */
-const MANY = 3e6;
+const MAX_LOCAL_SPLATS = 3e6;
 /** Largest number of device pixels per CSS pixel. */
-const DENSITY = 2;
+const MAX_DENSITY = 2;
 /** Maximum side of a picture that the server draws, pixels. */
-const MOST_SIDE = 4096;
+const MAX_SIDE = 4096;
 /** Milliseconds between the two pictures of a blink. */
-const BLINK = 700;
+const BLINK_INTERVAL = 700;
 
 /** What lines and layout depend on, besides the camera. @type {(keyof import("./state.js").Values)[]} */
-const LINES = ["pivot", "view", "views", "frusta", "axes", "clip", "measured", "metres", "scores", "compare", "tab", "scene", "sidebar",
-  "tool", "editing", "region", "transform", "selectMode", "brush", "highlight"];
+const OVERLAY_INPUTS = ["pivot", "view", "views", "frusta", "axes", "clip", "measured", "metres", "scores", "compare", "tab", "scene",
+  "sidebar", "tool", "editing", "region", "transform", "selectMode", "brush", "highlight"];
 
 export class Stage extends HTMLElement {
   /** What is on the screen now. @type {{ camera: Camera, k: Intrinsics, header: Header | null } | null} */
@@ -74,7 +74,7 @@ export class Stage extends HTMLElement {
       state.addEventListener(key, () => (this.dirty = true));
     }
     const touch = () => (this.stale = true);
-    for (const key of LINES) state.addEventListener(key, touch);
+    for (const key of OVERLAY_INPUTS) state.addEventListener(key, touch);
     // Lines over a served picture use its camera, so that its arrival renews them. A canvas renewed 60 times a second costs half a core
     // if the browser composes without a GPU.
     state.addEventListener("camera", () => (this.stale ||= this.drawsLocally));
@@ -111,7 +111,7 @@ export class Stage extends HTMLElement {
   }
 
   resize() {
-    this.density = Math.min(devicePixelRatio || 1, DENSITY);
+    this.density = Math.min(devicePixelRatio || 1, MAX_DENSITY);
     if (this.overlay) {
       this.overlay.width = Math.round(this.clientWidth * this.density);
       this.overlay.height = Math.round(this.clientHeight * this.density);
@@ -126,7 +126,7 @@ export class Stage extends HTMLElement {
     if (!this.local?.paints(state.get("mode")) || this.light !== null) return false;
     const drawing = state.get("drawing");
     if (drawing !== "auto") return drawing === "local";
-    return this.local.accelerated && scene.count <= MANY && !state.get("hello")?.live;
+    return this.local.accelerated && scene.count <= MAX_LOCAL_SPLATS && !state.get("hello")?.live;
   }
 
   /** The view in whose light the scene is shown: that of the photograph it is compared with, if any. @returns {number | null} */
@@ -146,7 +146,7 @@ export class Stage extends HTMLElement {
     const camera = state.get("camera");
     const rect = this.frameRect;
     // A larger stage gets a smaller picture, scaled.
-    const density = Math.min(this.density ?? 1, MOST_SIDE / Math.max(rect.width, rect.height, 1));
+    const density = Math.min(this.density ?? 1, MAX_SIDE / Math.max(rect.width, rect.height, 1));
     const [width, height] = [Math.max(1, Math.round(rect.width * density)), Math.max(1, Math.round(rect.height * density))];
     const k = intrinsics(width, height, camera.fov, state.insideView);
     const error = state.get("compare") === "error" && state.get("view") !== null;
@@ -331,7 +331,7 @@ export class Stage extends HTMLElement {
       photo.style.clipPath = "none";
       this.blinking = setInterval(() => {
         photo.style.visibility = photo.style.visibility === "visible" ? "hidden" : "visible";
-      }, BLINK);
+      }, BLINK_INTERVAL);
     }
   }
 

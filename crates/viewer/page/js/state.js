@@ -3,10 +3,12 @@
 /** @typedef {import("./camera.js").Camera} Camera */
 /** @typedef {import("./camera.js").View} View */
 /** @typedef {import("./math.js").Vec3} Vec3 */
+/** @typedef {import("./similarity.js").Similarity} Similarity */
 
 /** What the server tells about the scene.
  * @typedef {{ version: number, step: number | null, kind: string, count: number, sh_degree: number, travels: boolean, lights: boolean,
- *   placement: import("./edit/placement.js").Placement, world: { scale: number, center: Vec3 }, antialias: boolean, background: Vec3, center: Vec3, up: Vec3, radius: number, height: number, fov: number }} Scene */
+ *   placement: Similarity, world_from_photographs: Similarity, world: { scale: number, center: Vec3 }, antialias: boolean, background: Vec3,
+ *   center: Vec3, up: Vec3, radius: number, height: number, first: Vec3 | null, fov: number }} Scene */
 
 /**
  * @typedef {object} Values
@@ -49,8 +51,8 @@
  */
 
 /** Values that are saved between visits. */
-const KEPT = ["drawing", "navigation", "frusta", "axes", "sidebar", "tab", "theme", "speed", "brush", "visibleOnly"];
-const STORE = "irradia-viewer";
+const SAVED_KEYS = ["drawing", "navigation", "frusta", "axes", "sidebar", "tab", "theme", "speed", "brush", "visibleOnly"];
+const STORAGE_KEY = "irradia-viewer";
 
 class State extends EventTarget {
   constructor() {
@@ -64,8 +66,8 @@ class State extends EventTarget {
       editing: null, picked: null, train: null, hello: null, scores: new Map(), connection: "connecting", problem: null,
     };
     try {
-      const kept = JSON.parse(localStorage.getItem(STORE) ?? "{}");
-      for (const key of KEPT) if (key in kept) Object.assign(this.values, { [key]: kept[key] });
+      const kept = JSON.parse(localStorage.getItem(STORAGE_KEY) ?? "{}");
+      for (const key of SAVED_KEYS) if (key in kept) Object.assign(this.values, { [key]: kept[key] });
       if (innerWidth <= 720) this.values.sidebar = false;
     } catch {
       // Without stored values, or with those of another version, the page uses its defaults.
@@ -82,7 +84,7 @@ class State extends EventTarget {
     const changed = /** @type {(keyof Values)[]} */ (Object.keys(changes)).filter((key) => this.values[key] !== changes[key]);
     Object.assign(this.values, changes);
     for (const key of changed) this.dispatchEvent(new Event(key));
-    if (changed.some((key) => KEPT.includes(key))) this.keep();
+    if (changed.some((key) => SAVED_KEYS.includes(key))) this.keep();
   }
 
   /** Calls back now, and whenever one of the values changes. @param {(keyof Values)[]} keys @param {() => void} call */
@@ -94,7 +96,7 @@ class State extends EventTarget {
   keep() {
     try {
       const values = /** @type {any} */ (this.values);
-      localStorage.setItem(STORE, JSON.stringify(Object.fromEntries(KEPT.map((key) => [key, values[key]]))));
+      localStorage.setItem(STORAGE_KEY, JSON.stringify(Object.fromEntries(SAVED_KEYS.map((key) => [key, values[key]]))));
     } catch {
       // A private window may have no storage.
     }

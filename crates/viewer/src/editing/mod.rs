@@ -4,7 +4,7 @@
 mod save;
 mod session;
 mod uploads;
-mod work;
+mod worker;
 mod world;
 
 use crate::message::EditRequest;
@@ -21,11 +21,11 @@ use tokio::sync::watch;
 use save::folder_of;
 pub(crate) use save::stem_of;
 use uploads::Uploads;
-pub(crate) use work::work;
-pub(crate) use world::placed;
+pub(crate) use worker::run_editing;
+pub(crate) use world::{moved_camera, to_world};
 
 /// Maximum number of waiting requests.
-const WAITING: usize = 64;
+const MAX_WAITING: usize = 64;
 
 /// Why a request of a page is not fulfilled.
 #[derive(Debug, thiserror::Error)]
@@ -45,7 +45,7 @@ struct Queue {
 }
 
 /// The edited scene and its list of edits.
-type Current = (Arc<Draft>, Arc<EditList>);
+type EditedScene = (Arc<Draft>, Arc<EditList>);
 
 pub(crate) struct Editing {
     /// The file of the scene.
@@ -53,11 +53,11 @@ pub(crate) struct Editing {
     /// Scenes to merge.
     pub uploads: Arc<Uploads>,
     queue: Mutex<Queue>,
-    asked: Condvar,
+    request_added: Condvar,
     /// The state that pages are told.
-    told: watch::Sender<Arc<Value>>,
+    state: watch::Sender<Arc<Value>>,
     /// `None` before the first request.
-    current: Mutex<Option<Current>>,
+    current: Mutex<Option<EditedScene>>,
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -71,34 +71,34 @@ impl Editing {
             uploads: Arc::new(Uploads::new(folder_of(&source))),
             source,
             queue: Mutex::default(),
-            asked: Condvar::new(),
-            told: watch::Sender::new(Arc::new(work::untouched(splats))),
+            request_added: Condvar::new(),
+            state: watch::Sender::new(Arc::new(worker::initial_state(splats))),
             current: Mutex::default(),
         }
     }
 
     /// The state that pages are told, now and at every change.
     pub fn watch(&self) -> watch::Receiver<Arc<Value>> {
-        self.told.subscribe()
+        self.state.subscribe()
     }
 
-    fn tell(&self, told: Value) {
-        self.told.send_replace(Arc::new(told));
+    fn publish(&self, state: Value) {
+        self.state.send_replace(Arc::new(state));
     }
 
     /// Adds a request of a page, replacing a waiting one of the same gesture. Returns whether there was room.
-    pub fn ask(&self, seat: u64, request: EditRequest) -> bool {
+    pub fn push(&self, client: u64, request: EditRequest) -> bool {
         let mut queue = lock(&self.queue);
         let last = queue.waiting.back().and_then(|(_, last)| last.gesture());
         if last.is_some() && last == request.gesture() {
             queue.waiting.pop_back();
         }
-        if queue.waiting.len() >= WAITING {
+        if queue.waiting.len() >= MAX_WAITING {
             return false;
         }
-        queue.waiting.push_back((seat, request));
+        queue.waiting.push_back((client, request));
         drop(queue);
-        self.asked.notify_all();
+        self.request_added.notify_all();
         true
     }
 
@@ -112,20 +112,20 @@ impl Editing {
             if let Some(next) = queue.waiting.pop_front() {
                 return Some(next);
             }
-            queue = self.asked.wait(queue).unwrap_or_else(PoisonError::into_inner);
+            queue = self.request_added.wait(queue).unwrap_or_else(PoisonError::into_inner);
         }
     }
 
     pub fn close(&self) {
         lock(&self.queue).closing = true;
-        self.asked.notify_all();
+        self.request_added.notify_all();
     }
 
-    fn keep(&self, draft: &Arc<Draft>, list: EditList) {
+    fn set_current(&self, draft: &Arc<Draft>, list: EditList) {
         *lock(&self.current) = Some((draft.clone(), Arc::new(list)));
     }
 
-    fn current(&self) -> Option<Current> {
+    fn current(&self) -> Option<EditedScene> {
         lock(&self.current).clone()
     }
 
@@ -135,7 +135,7 @@ impl Editing {
     /// When nothing has been edited, and the file of the scene can no longer be read.
     pub fn cloud(&self) -> Result<GaussianCloud, FormatError> {
         match self.current() {
-            Some((draft, _)) => Ok(draft.shown().into_owned()),
+            Some((draft, _)) => Ok(draft.visible_cloud().into_owned()),
             None => read_splats(&self.source),
         }
     }

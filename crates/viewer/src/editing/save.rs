@@ -35,7 +35,7 @@ impl Saved {
 }
 
 /// A scene's file, or its folder of images.
-fn entry_of(source: &Path) -> &Path {
+fn scene_entry(source: &Path) -> &Path {
     match source.file_name().is_some_and(|name| name == "meta.json") {
         true => source.parent().unwrap_or(source),
         false => source,
@@ -44,12 +44,12 @@ fn entry_of(source: &Path) -> &Path {
 
 /// The folder that contains a scene's file or its folder of images.
 pub(super) fn folder_of(source: &Path) -> &Path {
-    entry_of(source).parent().unwrap_or(Path::new(""))
+    scene_entry(source).parent().unwrap_or(Path::new(""))
 }
 
 /// The name of a scene's file without the end that tells its format, or the name of its folder of images.
 pub(crate) fn stem_of(source: &Path) -> String {
-    let name = entry_of(source)
+    let name = scene_entry(source)
         .file_name()
         .map(|name| name.to_string_lossy().into_owned())
         .unwrap_or_default();
@@ -84,7 +84,7 @@ pub(super) fn save(session: &Session, source: &Path, before: Option<&Saved>) -> 
             .expect("some number is free"),
     };
     let parts = session.parts()?;
-    write_splats(&scene, &session.draft().shown())?;
+    write_splats(&scene, &session.draft().visible_cloud())?;
     write_own_cameras(source, &scene, &session.moved())?;
     let path_of = |name: &str| scene.with_extension(format!("{name}.ply"));
     for (name, part) in &parts {
@@ -113,14 +113,14 @@ pub(super) fn save(session: &Session, source: &Path, before: Option<&Saved>) -> 
 
 /// The file of a session's unsaved edits beside the scene: it is kept up to date, so that a crash loses nothing.
 #[derive(Default)]
-pub(super) struct Rest {
+pub(super) struct UnsavedEdits {
     /// The file and the list as it was written; `None` if nothing is unsaved.
     written: Option<(PathBuf, String)>,
     /// The scenes that the list merged when they were last written.
     merged: Vec<String>,
 }
 
-impl Rest {
+impl UnsavedEdits {
     /// The file, if there are unsaved edits.
     pub fn path(&self) -> Option<&Path> {
         self.written.as_ref().map(|(path, _)| path.as_path())
@@ -130,14 +130,14 @@ impl Rest {
     ///
     /// # Errors
     /// When a file cannot be written or removed.
-    pub fn keep(&mut self, session: &Session, source: &Path, saved: Option<&Saved>) -> Result<(), EditingError> {
+    pub fn update(&mut self, session: &Session, source: &Path, saved: Option<&Saved>) -> Result<(), EditingError> {
         let list = session.list();
         let text = list.to_toml();
         if list.edits.is_empty() || saved.is_some_and(|saved| saved.text == text) {
             return self.remove();
         }
         if self.written.as_ref().is_none_or(|(_, written)| *written != text) {
-            let path = self.path().map_or_else(|| unused(source), Path::to_owned);
+            let path = self.path().map_or_else(|| new_unsaved_path(source), Path::to_owned);
             write_atomic(&path, |out| out.write_all(text.as_bytes()))?;
             self.written = Some((path, text));
         }
@@ -162,7 +162,7 @@ impl Rest {
 }
 
 /// A new file for unsaved edits of the scene `source`.
-fn unused(source: &Path) -> PathBuf {
+fn new_unsaved_path(source: &Path) -> PathBuf {
     let (folder, stem) = (folder_of(source), stem_of(source));
     (1..)
         .map(|number: usize| folder.join(format!("{stem}.unsaved-{number}.toml")))
@@ -209,10 +209,10 @@ mod tests {
         };
         let file = folder.path().join("a.unsaved-1.toml");
         let mut session = Session::new(Draft::new(cloud, Vec::new()), Arc::new(Uploads::new(folder.path())));
-        let mut rest = Rest::default();
+        let mut unsaved = UnsavedEdits::default();
         let mut keep = |session: &Session, saved: Option<&Saved>| {
-            rest.keep(session, &source, saved).unwrap();
-            assert_eq!(rest.path(), file.exists().then_some(file.as_path()));
+            unsaved.update(session, &source, saved).unwrap();
+            assert_eq!(unsaved.path(), file.exists().then_some(file.as_path()));
             fs::read_to_string(&file).ok()
         };
         assert_eq!(keep(&session, None), None, "nothing was done");
@@ -223,9 +223,9 @@ mod tests {
         }
         let saved = save(&session, &source, None).unwrap();
         assert_eq!(keep(&session, Some(&saved)), None, "saved");
-        session.go(1).unwrap();
+        session.go_to(1).unwrap();
         assert_eq!(keep(&session, Some(&saved)), Some(session.list().to_toml()));
-        session.go(0).unwrap();
+        session.go_to(0).unwrap();
         assert_eq!(keep(&session, Some(&saved)), None, "all is undone");
     }
 }

@@ -11,15 +11,15 @@ use irradia_scene::{GaussianCloud, Similarity};
 use std::sync::Arc;
 
 /// Maximum bytes of earlier states that are kept for an immediate undo; without a kept state, undo makes the edits again.
-const KEPT_BYTES: usize = 1 << 30;
+const MAX_SNAPSHOT_BYTES: usize = 1 << 30;
 /// Maximum number of entries in the list. A selection may take 60 kB.
-const MOST_ENTRIES: usize = 20_000;
+const MAX_ENTRIES: usize = 20_000;
 /// Maximum count of numbers in all selections of the list.
-const MOST_POINTS: usize = 8_000_000;
+const MAX_SELECTION_NUMBERS: usize = 8_000_000;
 
 /// The action of an entry.
 #[derive(Clone, Debug)]
-enum Deed {
+enum Action {
     Select {
         steps: Vec<SelectStep>,
         replace: bool,
@@ -34,11 +34,11 @@ struct Entry {
     /// Entries of the same gesture replace each other.
     gesture: u64,
     text: String,
-    deed: Deed,
+    action: Action,
 }
 
 /// A state after a number of edits.
-struct Kept {
+struct Snapshot {
     edits: usize,
     draft: Arc<Draft>,
 }
@@ -46,10 +46,10 @@ struct Kept {
 pub(crate) struct Session {
     entries: Vec<Entry>,
     /// The current position: number of entries that are made.
-    at: usize,
+    position: usize,
     draft: Arc<Draft>,
     /// The scene as it was opened, then newer states, oldest first.
-    kept: Vec<Kept>,
+    snapshots: Vec<Snapshot>,
     /// The steps of the current selection.
     steps: Vec<SelectStep>,
     selected: Arc<Selection>,
@@ -62,7 +62,7 @@ pub(crate) struct Session {
 }
 
 /// An entry in the form that pages list.
-pub(crate) struct Listed<'a> {
+pub(crate) struct EntryView<'a> {
     pub is_edit: bool,
     pub text: &'a str,
 }
@@ -73,9 +73,9 @@ impl Session {
         let draft = Arc::new(draft);
         Self {
             entries: Vec::new(),
-            at: 0,
+            position: 0,
             selected: Arc::new(Selection::none(draft.len())),
-            kept: vec![Kept {
+            snapshots: vec![Snapshot {
                 edits: 0,
                 draft: draft.clone(),
             }],
@@ -93,7 +93,7 @@ impl Session {
 
     /// The scene as it was opened.
     pub fn original(&self) -> &Arc<Draft> {
-        &self.kept[0].draft
+        &self.snapshots[0].draft
     }
 
     /// The selected splats of [`Self::draft`].
@@ -102,28 +102,32 @@ impl Session {
     }
 
     /// Number of entries that are made.
-    pub fn at(&self) -> usize {
-        self.at
+    pub fn position(&self) -> usize {
+        self.position
     }
 
     /// All entries, including those undone.
-    pub fn entries(&self) -> impl ExactSizeIterator<Item = Listed<'_>> {
-        self.entries.iter().map(|entry| Listed {
-            is_edit: matches!(entry.deed, Deed::Edit(..)),
+    pub fn entries(&self) -> impl ExactSizeIterator<Item = EntryView<'_>> {
+        self.entries.iter().map(|entry| EntryView {
+            is_edit: matches!(entry.action, Action::Edit(..)),
             text: &entry.text,
         })
     }
 
     /// The gesture of the entry made last; 0 if there is none.
     pub fn gesture(&self) -> u64 {
-        self.at.checked_sub(1).map_or(0, |last| self.entries[last].gesture)
+        self.position
+            .checked_sub(1)
+            .map_or(0, |last| self.entries[last].gesture)
     }
 
     fn edits(&self) -> impl Iterator<Item = &Edit> {
-        self.entries[..self.at].iter().filter_map(|entry| match &entry.deed {
-            Deed::Edit(edit, _) => Some(edit),
-            _ => None,
-        })
+        self.entries[..self.position]
+            .iter()
+            .filter_map(|entry| match &entry.action {
+                Action::Edit(edit, _) => Some(edit),
+                _ => None,
+            })
     }
 
     /// The edits that are made.
@@ -136,10 +140,12 @@ impl Session {
 
     /// How the edits moved the whole scene, in the dataset's coordinates.
     pub fn moved(&self) -> Transform {
-        let moved = self.entries[..self.at].iter().filter_map(|entry| match &entry.deed {
-            Deed::Edit(_, moved) => moved.as_ref(),
-            _ => None,
-        });
+        let moved = self.entries[..self.position]
+            .iter()
+            .filter_map(|entry| match &entry.action {
+                Action::Edit(_, moved) => moved.as_ref(),
+                _ => None,
+            });
         moved.fold(Transform::IDENTITY, |all, next| all.then(next))
     }
 
@@ -157,10 +163,10 @@ impl Session {
     /// # Errors
     /// When they cannot be evaluated, or there is nothing to subtract from or to intersect with.
     pub fn select(&mut self, gesture: u64, replace: bool, mut steps: Vec<SelectStep>) -> Result<(), EditError> {
-        self.has_room(&steps)?;
+        self.check_capacity(&steps)?;
         let world = *self.world();
         steps.iter_mut().for_each(|step| step_to_dataset(step, &world));
-        self.in_place_of(gesture, |session| {
+        self.replace_gesture(gesture, |session| {
             let before = if replace { Vec::new() } else { session.steps.clone() };
             if before.is_empty() && steps.first().is_none_or(|step| step.mode != Mode::Add) {
                 return Err(EditError::Selection("nothing is selected to subtract from".to_owned()));
@@ -168,7 +174,7 @@ impl Session {
             let all = [&before[..], &steps].concat();
             let selected = session.evaluate(&all, before.len())?;
             let text = select_text(&steps, replace);
-            session.push(gesture, text, Deed::Select { steps, replace });
+            session.push(gesture, text, Action::Select { steps, replace });
             (session.steps, session.selected) = (all, Arc::new(selected));
             Ok(())
         })
@@ -191,7 +197,7 @@ impl Session {
             _ => (*self.selected).clone(),
         };
         for step in &steps[known..] {
-            let alone = self.alone(&step.shape)?;
+            let alone = self.select_shape(&step.shape)?;
             match step.mode {
                 Mode::Add => selected.add(&alone),
                 Mode::Subtract => selected.subtract(&alone),
@@ -202,7 +208,7 @@ impl Session {
     }
 
     /// What a shape selects.
-    fn alone(&mut self, shape: &Shape) -> Result<Selection, EditError> {
+    fn select_shape(&mut self, shape: &Shape) -> Result<Selection, EditError> {
         let Shape::Floaters { score } = shape else {
             return select(&self.draft, &[SelectStep::add(shape.clone())]);
         };
@@ -225,7 +231,7 @@ impl Session {
         if self.steps.is_empty() {
             return;
         }
-        self.push(0, "Deselect".to_owned(), Deed::Deselect);
+        self.push(0, "Deselect".to_owned(), Action::Deselect);
         (self.steps, self.selected) = (Vec::new(), Arc::new(Selection::none(self.draft.len())));
     }
 
@@ -234,14 +240,14 @@ impl Session {
     /// # Errors
     /// When nothing is selected, or the edit is not possible; nothing has changed then.
     pub fn edit(&mut self, gesture: u64, whole: bool, mut op: Operation) -> Result<(), EditError> {
-        self.has_room(&[])?;
+        self.check_capacity(&[])?;
         operation_to_dataset(&mut op, self.world());
-        self.in_place_of(gesture, |session| {
+        self.replace_gesture(gesture, |session| {
             if !whole && session.selected.is_empty() {
                 return Err(EditError::Selection("nothing is selected".to_owned()));
             }
             let select = (!whole).then(|| session.steps.clone());
-            session.make(gesture, Edit { op, select })
+            session.apply_edit(gesture, Edit { op, select })
         })
     }
 
@@ -262,15 +268,15 @@ impl Session {
         }
         for (i, edit) in list.edits.iter().enumerate() {
             let made = self
-                .has_room(edit.select.as_deref().unwrap_or_default())
-                .and_then(|()| self.make(0, edit.clone()));
+                .check_capacity(edit.select.as_deref().unwrap_or_default())
+                .and_then(|()| self.apply_edit(0, edit.clone()));
             made.map_err(|reason| in_list(i, reason))?;
         }
         Ok(())
     }
 
     /// Makes an edit and adds it to the list.
-    fn make(&mut self, gesture: u64, mut edit: Edit) -> Result<(), EditError> {
+    fn apply_edit(&mut self, gesture: u64, mut edit: Edit) -> Result<(), EditError> {
         if let Operation::Split { name } = &mut edit.op {
             let parts = self.edits().filter(|edit| matches!(edit.op, Operation::Split { .. }));
             *name = format!("part-{}", parts.count() + 1);
@@ -284,25 +290,25 @@ impl Session {
         };
         self.before = Some((self.draft.clone(), self.steps.clone(), self.selected.clone()));
         let text = edit_text(&applied.edit.op, applied.selected, self.draft.len(), draft.len());
-        self.push(gesture, text, Deed::Edit(applied.edit, applied.moved));
+        self.push(gesture, text, Action::Edit(applied.edit, applied.moved));
         self.set_draft(Arc::new(draft));
-        self.steps = self.steps_at(self.at);
+        self.steps = self.steps_at(self.position);
         self.selected = Arc::new(select(&self.draft, &self.steps)?);
         Ok(())
     }
 
-    fn has_room(&self, steps: &[SelectStep]) -> Result<(), EditError> {
-        let points = |steps: &[SelectStep]| steps.iter().map(points_of).sum::<usize>();
+    fn check_capacity(&self, steps: &[SelectStep]) -> Result<(), EditError> {
+        let points = |steps: &[SelectStep]| steps.iter().map(count_numbers).sum::<usize>();
         let all: usize = self
             .entries
             .iter()
-            .map(|entry| match &entry.deed {
-                Deed::Select { steps, .. } => points(steps),
-                Deed::Edit(edit, _) => points(edit.select.as_deref().unwrap_or_default()),
-                Deed::Deselect => 0,
+            .map(|entry| match &entry.action {
+                Action::Select { steps, .. } => points(steps),
+                Action::Edit(edit, _) => points(edit.select.as_deref().unwrap_or_default()),
+                Action::Deselect => 0,
             })
             .sum();
-        if self.entries.len() >= MOST_ENTRIES || all + points(steps) > MOST_POINTS {
+        if self.entries.len() >= MAX_ENTRIES || all + points(steps) > MAX_SELECTION_NUMBERS {
             let message = "the list of edits is full: save the scene and open the saved one";
             return Err(EditError::Scene(message.to_owned()));
         }
@@ -310,43 +316,48 @@ impl Session {
     }
 
     /// Runs `next` in place of the last entry if that is of the same gesture; if it fails, the last entry stays.
-    fn in_place_of(
+    fn replace_gesture(
         &mut self,
         gesture: u64,
         next: impl FnOnce(&mut Self) -> Result<(), EditError>,
     ) -> Result<(), EditError> {
-        let replaces = gesture != 0 && self.at == self.entries.len() && self.gesture() == gesture;
+        let replaces = gesture != 0 && self.position == self.entries.len() && self.gesture() == gesture;
         if !replaces {
             return next(self);
         }
-        self.go(self.at - 1)?;
+        self.go_to(self.position - 1)?;
         let outcome = next(self);
         if outcome.is_err() {
-            self.go(self.at + 1)?;
+            self.go_to(self.position + 1)?;
         }
         outcome
     }
 
-    fn push(&mut self, gesture: u64, text: String, deed: Deed) {
+    fn push(&mut self, gesture: u64, text: String, action: Action) {
         let edits = self.edits().count();
-        self.kept.retain(|kept| kept.edits <= edits);
-        self.entries.truncate(self.at);
-        self.entries.push(Entry { gesture, text, deed });
-        self.at += 1;
+        self.snapshots.retain(|snapshot| snapshot.edits <= edits);
+        self.entries.truncate(self.position);
+        self.entries.push(Entry { gesture, text, action });
+        self.position += 1;
     }
 
     /// Sets the state after the current edits, and keeps it.
     fn set_draft(&mut self, draft: Arc<Draft>) {
         let edits = self.edits().count();
         self.draft = draft.clone();
-        if self.kept.iter().all(|kept| kept.edits != edits) {
-            self.kept.push(Kept { edits, draft });
-            self.kept.sort_unstable_by_key(|kept| kept.edits);
+        if self.snapshots.iter().all(|snapshot| snapshot.edits != edits) {
+            self.snapshots.push(Snapshot { edits, draft });
+            self.snapshots.sort_unstable_by_key(|snapshot| snapshot.edits);
         }
-        let bytes = |kept: &[Kept]| kept.iter().map(|kept| bytes_of(&kept.draft.cloud)).sum::<usize>();
+        let bytes = |snapshots: &[Snapshot]| {
+            snapshots
+                .iter()
+                .map(|snapshot| cloud_bytes(&snapshot.draft.cloud))
+                .sum::<usize>()
+        };
         // The opened scene and the last two states stay.
-        while self.kept.len() > 3 && bytes(&self.kept) > KEPT_BYTES {
-            self.kept.remove(1);
+        while self.snapshots.len() > 3 && bytes(&self.snapshots) > MAX_SNAPSHOT_BYTES {
+            self.snapshots.remove(1);
         }
     }
 
@@ -354,18 +365,18 @@ impl Session {
     fn steps_at(&self, at: usize) -> Vec<SelectStep> {
         let mut steps = Vec::new();
         for entry in &self.entries[..at] {
-            match &entry.deed {
-                Deed::Select { steps: more, replace } => {
+            match &entry.action {
+                Action::Select { steps: more, replace } => {
                     if *replace {
                         steps.clear();
                     }
                     steps.extend_from_slice(more);
                 }
-                Deed::Deselect => steps.clear(),
-                Deed::Edit(edit, _) => {
+                Action::Deselect => steps.clear(),
+                Action::Edit(edit, _) => {
                     steps.clear();
                     let is_whole = edit.select.is_none();
-                    if leaves_selection(&edit.op) && is_whole == matches!(edit.op, Operation::Merge { .. }) {
+                    if keeps_selection(&edit.op) && is_whole == matches!(edit.op, Operation::Merge { .. }) {
                         steps.push(SelectStep::add(Shape::Last {}));
                     }
                 }
@@ -378,19 +389,20 @@ impl Session {
     ///
     /// # Errors
     /// Those of the edits, although these have been made before: a merged file may be gone. Nothing has changed then.
-    pub fn go(&mut self, at: usize) -> Result<(), EditError> {
+    pub fn go_to(&mut self, at: usize) -> Result<(), EditError> {
         let at = at.min(self.entries.len());
         let before = self.edits().count();
-        let was = std::mem::replace(&mut self.at, at);
+        let previous = std::mem::replace(&mut self.position, at);
         let edits = self.edits().count();
         if edits != before {
-            let nearest = self.kept.iter().rfind(|kept| kept.edits <= edits);
-            let (mut made, mut draft) =
-                nearest.map_or((0, self.original().clone()), |kept| (kept.edits, kept.draft.clone()));
+            let nearest = self.snapshots.iter().rfind(|snapshot| snapshot.edits <= edits);
+            let (mut made, mut draft) = nearest.map_or((0, self.original().clone()), |snapshot| {
+                (snapshot.edits, snapshot.draft.clone())
+            });
             let again: Vec<Edit> = self.edits().skip(made).cloned().collect();
             for edit in again {
                 if let Err(error) = apply(Arc::make_mut(&mut draft), &edit, &|file| self.uploads.open(file)) {
-                    self.at = was;
+                    self.position = previous;
                     return Err(error);
                 }
                 made += 1;
@@ -448,7 +460,7 @@ impl Session {
 }
 
 /// Whether the selected splats still exist after the operation, and stay selected.
-fn leaves_selection(op: &Operation) -> bool {
+fn keeps_selection(op: &Operation) -> bool {
     matches!(
         op,
         Operation::Move { .. }
@@ -462,14 +474,14 @@ fn leaves_selection(op: &Operation) -> bool {
 }
 
 /// Count of numbers in a step.
-fn points_of(step: &SelectStep) -> usize {
+fn count_numbers(step: &SelectStep) -> usize {
     match &step.shape {
         Shape::Polygon { points, .. } | Shape::Brush { points, .. } => 16 + 2 * points.len(),
         _ => 16,
     }
 }
 
-fn bytes_of(cloud: &GaussianCloud) -> usize {
+fn cloud_bytes(cloud: &GaussianCloud) -> usize {
     4 * cloud.len() * (11 + 3 * cloud.sh_coefficients())
 }
 
@@ -643,13 +655,13 @@ mod tests {
             )
             .expect("scaled");
         then(&session);
-        assert_eq!((session.at(), session.entries().len(), states.len()), (5, 5, 6));
+        assert_eq!((session.position(), session.entries().len(), states.len()), (5, 5, 6));
         for forget in [false, true] {
             for at in [0, 5, 3, 1, 4, 2, 5, 0] {
                 if forget {
-                    session.kept.truncate(1);
+                    session.snapshots.truncate(1);
                 }
-                session.go(at).expect("made before");
+                session.go_to(at).expect("made before");
                 assert_eq!(
                     (&**session.draft(), &**session.selected()),
                     (&*states[at].0, &*states[at].1),
@@ -675,19 +687,22 @@ mod tests {
         let mut opened = super::tests::session(8);
         opened.replay(&list).expect("the same edits");
         assert_eq!(opened.draft(), session.draft());
-        assert_eq!((opened.at(), opened.list()), (2, list.clone()), "an entry each");
-        opened.go(0).expect("undone");
+        assert_eq!((opened.position(), opened.list()), (2, list.clone()), "an entry each");
+        opened.go_to(0).expect("undone");
         assert_eq!(opened.draft(), opened.original());
         // One that fails tells which; those before it are made.
         let mut broken = list.clone();
         broken.edits.push("upright".parse().expect("an edit"));
         let error = opened.replay(&broken).expect_err("no cameras").to_string();
-        assert!(error.contains('3') && opened.at() == 2, "{error}");
+        assert!(error.contains('3') && opened.position() == 2, "{error}");
         // A missing scene is found before the first edit is made.
         let file = "absent.ply".to_owned();
         *broken.edits.last_mut().expect("three") = Edit::of_scene(Operation::Merge { file });
         let error = opened.replay(&broken).expect_err("no such scene").to_string();
-        assert!(error.starts_with("edit 3: merge: ") && opened.at() == 2, "{error}");
+        assert!(
+            error.starts_with("edit 3: merge: ") && opened.position() == 2,
+            "{error}"
+        );
     }
 
     #[test]
@@ -697,15 +712,18 @@ mod tests {
         let known = session.selected().clone();
         for factor in [0.9, 0.5, 0.2] {
             session.edit(2, false, Operation::Opacity { factor }).expect("faded");
-            assert_eq!((session.at(), replayed(&session)), (2, (**session.draft()).clone()));
+            assert_eq!(
+                (session.position(), replayed(&session)),
+                (2, (**session.draft()).clone())
+            );
         }
-        session.go(1).expect("undone");
+        session.go_to(1).expect("undone");
         assert!(Arc::ptr_eq(session.selected(), &known), "it is not evaluated again");
         // The same steps select something else in another state.
         session.edit(3, false, Operation::Delete {}).expect("deleted");
         session.select(4, true, ball(1.0, 1.2)).expect("a ball");
-        session.go(2).expect("undone");
-        session.go(3).expect("made before");
+        session.go_to(2).expect("undone");
+        session.go_to(3).expect("made before");
         assert_eq!((session.selected().len(), selected(&session)), (3, vec![]));
         assert_eq!(replayed(&session), **session.draft());
     }
@@ -726,7 +744,7 @@ mod tests {
         });
         assert!(session.select(7, true, vec![views]).is_err(), "no cameras");
         assert_eq!(
-            (session.at(), selected(&session)),
+            (session.position(), selected(&session)),
             (1, vec![1]),
             "the entry of the gesture is still there"
         );

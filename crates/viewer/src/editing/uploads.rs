@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
 /// Maximum bytes of all files that are kept.
-const MOST_BYTES: usize = 1 << 30;
+const MAX_TOTAL_BYTES: usize = 1 << 30;
 
 struct Upload {
     bytes: Vec<u8>,
@@ -38,7 +38,7 @@ impl Uploads {
     /// # Errors
     /// When it is not a splat file, or there is no room.
     pub fn add(&self, name: &str, bytes: Vec<u8>) -> Result<(String, usize), EditingError> {
-        let name: String = name.chars().map(plain).collect();
+        let name: String = name.chars().map(sanitized).collect();
         let path = PathBuf::from(name.trim_start_matches('.'));
         let format = SplatFormat::of(&path)?;
         if !format.is_readable() || format == SplatFormat::SogFolder {
@@ -63,7 +63,7 @@ impl Uploads {
             None => self.is_free(name, &bytes),
         };
         let name = (1..).map(numbered).find(is_free).expect("some number is free");
-        if kept + bytes.len() > MOST_BYTES && !files.contains_key(&name) {
+        if kept + bytes.len() > MAX_TOTAL_BYTES && !files.contains_key(&name) {
             return Err(refused(
                 "there is no room for more scenes: merge them with irradia edit".to_owned(),
             ));
@@ -124,7 +124,7 @@ fn refused(message: String) -> EditingError {
 }
 
 /// `c`, or an underscore for a character that some systems refuse in file names or that could form a path.
-fn plain(c: char) -> char {
+fn sanitized(c: char) -> char {
     match c.is_alphanumeric() || "-_.".contains(c) {
         true => c,
         false => '_',

@@ -38,6 +38,15 @@ pub(crate) fn operation_to_dataset(op: &mut Operation, world: &Similarity) {
     }
 }
 
+/// From the dataset's coordinates to `world`.
+pub(crate) fn to_world(world: &Similarity) -> Transform {
+    Transform {
+        scale: world.scale,
+        rotation: DQuat::IDENTITY,
+        translation: world.apply(DVec3::ZERO),
+    }
+}
+
 /// The transform of the scene from the world `from` to the world `to`, after it was moved by `moved` in the dataset's coordinates.
 pub(crate) fn placement(from: &Similarity, moved: &Transform, to: &Similarity) -> Transform {
     // to (k R (x / s + c) + t - c')
@@ -49,7 +58,7 @@ pub(crate) fn placement(from: &Similarity, moved: &Transform, to: &Similarity) -
 }
 
 /// `camera`, moved with the scene.
-pub(crate) fn placed(camera: &Camera, by: &Transform) -> Camera {
+pub(crate) fn moved_camera(camera: &Camera, by: &Transform) -> Camera {
     let mut camera = *camera;
     let rotation: DQuat = by.rotation * camera.pose.rotation.as_dquat();
     camera.pose.rotation = rotation.normalize().as_quat();
@@ -61,7 +70,7 @@ pub(crate) fn placed(camera: &Camera, by: &Transform) -> Camera {
 mod tests {
     use super::*;
 
-    const FAR: Similarity = Similarity {
+    const DISTANT_WORLD: Similarity = Similarity {
         scale: 0.01,
         center: DVec3::new(1e5, -2e5, 30.0),
     };
@@ -72,14 +81,14 @@ mod tests {
             center: [1.0, 2.0, 3.0],
             radius: 0.5,
         });
-        step_to_dataset(&mut step, &FAR);
+        step_to_dataset(&mut step, &DISTANT_WORLD);
         let Shape::Sphere { center, radius } = step.shape else {
             panic!("a sphere")
         };
         assert!((radius - 50.0).abs() < 1e-9);
         assert!((DVec3::from(center) - DVec3::new(100_100.0, -199_800.0, 330.0)).length() < 1e-6);
         let mut op = Operation::Move { by: [0.0, 0.0, 1.0] };
-        operation_to_dataset(&mut op, &FAR);
+        operation_to_dataset(&mut op, &DISTANT_WORLD);
         assert_eq!(op, Operation::Move { by: [0.0, 0.0, 100.0] });
     }
 
@@ -90,9 +99,11 @@ mod tests {
             scale: 0.02,
             center: DVec3::new(5.0, 6.0, 7.0),
         };
-        let by = placement(&FAR, &moved, &to);
+        let by = placement(&DISTANT_WORLD, &moved, &to);
         let point = DVec3::new(0.3, -0.2, 0.1);
-        let expected = to.apply(moved.apply(FAR.invert(point)));
+        let expected = to.apply(moved.apply(DISTANT_WORLD.invert(point)));
         assert!((by.apply(point) - expected).length() < 1e-6 * expected.length());
+        let there = to_world(&DISTANT_WORLD).apply(DISTANT_WORLD.invert(point));
+        assert!((there - point).length() < 1e-6);
     }
 }

@@ -10,12 +10,12 @@ use std::fs;
 /// A page that has been greeted.
 fn page(served: &Served) -> Socket {
     let mut page = served.socket();
-    told(&mut page, "editing");
+    next_message(&mut page, "editing");
     page
 }
 
 /// The next message of a kind.
-fn told(page: &mut Socket, kind: &str) -> Value {
+fn next_message(page: &mut Socket, kind: &str) -> Value {
     loop {
         let (opcode, bytes) = page.receive().expect("a message");
         if opcode == 1 {
@@ -27,15 +27,15 @@ fn told(page: &mut Socket, kind: &str) -> Value {
     }
 }
 
-fn ask(page: &mut Socket, request: &Value) {
+fn send_request(page: &mut Socket, request: &Value) {
     assert!(page.send(1, request.to_string().as_bytes()));
 }
 
 /// Sends a request; returns the state of the session once `key` has the value `value`.
-fn after(page: &mut Socket, request: &Value, (key, value): (&str, Value)) -> Value {
-    ask(page, request);
+fn request_state(page: &mut Socket, request: &Value, (key, value): (&str, Value)) -> Value {
+    send_request(page, request);
     loop {
-        let editing = told(page, "editing");
+        let editing = next_message(page, "editing");
         if editing["busy"] == false && editing[key] == value {
             return editing;
         }
@@ -44,11 +44,11 @@ fn after(page: &mut Socket, request: &Value, (key, value): (&str, Value)) -> Val
 
 /// Sends a request; returns why it is refused.
 fn refusal(page: &mut Socket, request: &Value) -> String {
-    ask(page, request);
-    told(page, "problem")["text"].as_str().expect("text").to_owned()
+    send_request(page, request);
+    next_message(page, "problem")["text"].as_str().expect("text").to_owned()
 }
 
-fn right_one() -> Value {
+fn select_right_splat() -> Value {
     json!({ "do": "select", "replace": true, "steps": [{ "shape": "sphere", "center": [1, 0, 0], "radius": 0.5 }] })
 }
 
@@ -57,32 +57,32 @@ fn pages_share_a_session_that_leaves_the_source_alone() {
     let served = serve("127.0.0.1");
     let source = fs::read(served.scene()).expect("the scene");
     let (mut first, mut second) = (page(&served), page(&served));
-    let selected = after(&mut first, &right_one(), ("selected", json!(1)));
+    let selected = request_state(&mut first, &select_right_splat(), ("selected", json!(1)));
     assert_eq!(selected["box"], json!([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]));
-    let deleted = after(
+    let deleted = request_state(
         &mut first,
         &json!({ "do": "edit", "edit": { "op": "delete" } }),
         ("at", json!(2)),
     );
     assert_eq!((&selected["of"], &deleted["of"]), (&json!(3), &json!(2)));
-    while told(&mut second, "editing") != deleted {}
+    while next_message(&mut second, "editing") != deleted {}
     let name = json!("saved scene.edits.toml and scene.edited.ply");
-    after(&mut second, &json!({ "do": "save" }), ("saved", name));
+    request_state(&mut second, &json!({ "do": "save" }), ("saved", name));
     let folder = served.scene().parent().expect("a folder").to_owned();
     assert_eq!(read_splats(&folder.join("scene.edited.ply")).expect("splats").len(), 2);
     assert_eq!(fs::read(served.scene()).expect("the scene"), source);
     let list = fs::read_to_string(folder.join("scene.edits.toml")).expect("the list");
     let list = irradia_edit::EditList::parse(&list).expect("a list");
     assert_eq!(list.edits[0].to_string(), "delete sphere center=1,0,0 radius=0.5");
-    after(&mut second, &json!({ "do": "undo" }), ("selected", json!(1)));
-    after(&mut second, &json!({ "do": "go", "at": 0 }), ("selected", json!(0)));
-    after(&mut second, &json!({ "do": "go", "at": u32::MAX }), ("of", json!(2)));
+    request_state(&mut second, &json!({ "do": "undo" }), ("selected", json!(1)));
+    request_state(&mut second, &json!({ "do": "go", "at": 0 }), ("selected", json!(0)));
+    request_state(&mut second, &json!({ "do": "go", "at": u32::MAX }), ("of", json!(2)));
     // Another session does not replace what this one saved.
     let again = Served::of(served.scene(), "127.0.0.1");
     let mut third = page(&again);
-    after(&mut third, &right_one(), ("selected", json!(1)));
+    request_state(&mut third, &select_right_splat(), ("selected", json!(1)));
     let name = json!("saved scene.edits-2.toml and scene.edited-2.ply");
-    after(&mut third, &json!({ "do": "save" }), ("saved", name));
+    request_state(&mut third, &json!({ "do": "save" }), ("saved", name));
 }
 
 #[test]
@@ -145,11 +145,11 @@ fn hostile_requests_are_refused_in_one_line_and_change_nothing() {
     ] {
         assert!(page.send(1, text.as_bytes()));
     }
-    let editing = after(&mut page, &right_one(), ("selected", json!(1)));
+    let editing = request_state(&mut page, &select_right_splat(), ("selected", json!(1)));
     assert_eq!((&editing["total"], &editing["of"]), (&json!(1), &json!(3)));
     page.send(1, lasso(20_000).to_string().as_bytes());
     assert!(page.is_ended(), "larger than any request");
-    served.draws();
+    served.assert_draws();
 }
 
 #[test]
@@ -171,12 +171,12 @@ fn a_scene_that_a_page_sends_is_merged_saved_and_replayed() {
     let answer = served.send_scene("/merge/..%2Fother.spz", &served.origin(), &sent);
     assert!(answer.contains(r#"{"name":"_other.spz","splats":3}"#), "{answer}");
     let merge = json!({ "do": "edit", "whole": true, "edit": { "op": "merge", "file": "_other.spz" } });
-    let merged = after(&mut page, &merge, ("of", json!(6)));
+    let merged = request_state(&mut page, &merge, ("of", json!(6)));
     assert_eq!(merged["selected"], json!(3), "what came is selected");
-    after(&mut page, &json!({ "do": "undo" }), ("of", json!(3)));
-    after(&mut page, &json!({ "do": "redo" }), ("of", json!(6)));
+    request_state(&mut page, &json!({ "do": "undo" }), ("of", json!(3)));
+    request_state(&mut page, &json!({ "do": "redo" }), ("of", json!(6)));
     let name = json!("saved scene.edits.toml and scene.edited.ply");
-    after(&mut page, &json!({ "do": "save" }), ("saved", name));
+    request_state(&mut page, &json!({ "do": "save" }), ("saved", name));
     let folder = served.scene().parent().expect("a folder");
     assert_eq!(fs::read(folder.join("_other.spz")).expect("what was sent"), sent);
     let list = fs::read_to_string(folder.join("scene.edits.toml")).expect("the list");
@@ -192,7 +192,7 @@ fn a_scene_that_a_page_sends_is_merged_saved_and_replayed() {
 fn a_download_needs_a_known_format_and_the_token() {
     let served = serve("127.0.0.1");
     let host = served.host();
-    after(&mut page(&served), &right_one(), ("selected", json!(1)));
+    request_state(&mut page(&served), &select_right_splat(), ("selected", json!(1)));
     for name in [
         "ply",
         "compressed.ply",
@@ -240,6 +240,45 @@ fn what_is_no_scene_of_splats_is_not_edited() {
     .expect("a dataset");
     let served = Served::of(&data, "127.0.0.1");
     let mut page = served.socket();
-    assert!(refusal(&mut page, &right_one()).contains("dataset"));
+    assert!(refusal(&mut page, &select_right_splat()).contains("dataset"));
     assert_eq!(served.status("/download/ply", &[&served.host()]), 404);
+}
+
+#[test]
+fn a_scene_that_is_turned_is_seen_from_the_same_side_and_keeps_its_paths() {
+    let served = serve("127.0.0.1");
+    let folder = served.scene().parent().expect("a folder");
+    let camera = |name: &str, x: f64| {
+        json!({ "name": name, "width": 64, "height": 48, "fx": 50, "fy": 50, "cx": 32, "cy": 24,
+                "position": [x, 0, -4], "rotation": [1, 0, 0, 0] })
+    };
+    let cameras = json!([camera("a", 3.0), camera("b", -3.0)]);
+    fs::write(folder.join("cameras.json"), cameras.to_string()).expect("written");
+    let near = |value: &Value, expected: &[f64]| {
+        let values: Vec<f64> = value
+            .as_array()
+            .expect("numbers")
+            .iter()
+            .filter_map(Value::as_f64)
+            .collect();
+        let close = values.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-5);
+        assert!(close && values.len() == expected.len(), "{values:?}");
+    };
+    let half = std::f64::consts::FRAC_1_SQRT_2;
+    let turned = |scene: &Value| {
+        near(&scene["first"], &[0.0, 3.0, -4.0]);
+        near(&scene["world_from_photographs"]["rotation"], &[half, 0.0, 0.0, half]);
+        near(&scene["world_from_photographs"]["translation"], &[0.0; 3]);
+    };
+    let opened = Served::of(served.scene(), "127.0.0.1");
+    let mut page = opened.socket();
+    near(&next_message(&mut page, "hello")["scene"]["first"], &[3.0, 0.0, -4.0]);
+    next_message(&mut page, "editing");
+    let turn = json!({ "op": "rotate", "axis": [0, 0, 1], "degrees": 90 });
+    send_request(&mut page, &json!({ "do": "edit", "whole": true, "edit": turn }));
+    turned(&next_message(&mut page, "scene"));
+    let name = json!("saved scene.edits.toml and scene.edited.ply");
+    request_state(&mut page, &json!({ "do": "save" }), ("saved", name));
+    let again = Served::of(&folder.join("scene.edited.ply"), "127.0.0.1");
+    turned(&next_message(&mut again.socket(), "hello")["scene"]);
 }

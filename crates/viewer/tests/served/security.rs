@@ -14,7 +14,7 @@ use tempfile::TempDir;
 /// A viewer, and the lines that it reported.
 pub struct Served {
     viewer: Viewer,
-    told: Arc<Mutex<Vec<String>>>,
+    reported: Arc<Mutex<Vec<String>>>,
     scene: PathBuf,
     _folder: Option<TempDir>,
 }
@@ -44,10 +44,10 @@ impl Served {
     /// A viewer of `scene`.
     pub fn of(scene: &Path, host: &str) -> Self {
         let subject = Subject::open(scene, None, &Default::default()).expect("a scene");
-        let told = Arc::new(Mutex::new(Vec::new()));
+        let reported = Arc::new(Mutex::new(Vec::new()));
         let tell = {
-            let told = told.clone();
-            move |line: &str| told.lock().expect("no panic").push(line.to_owned())
+            let reported = reported.clone();
+            move |line: &str| reported.lock().expect("no panic").push(line.to_owned())
         };
         let listen = Listen {
             host: host.to_owned(),
@@ -56,7 +56,7 @@ impl Served {
         };
         Self {
             viewer: Viewer::start(subject, &listen, Box::new(tell)).expect("a server"),
-            told,
+            reported,
             scene: scene.to_owned(),
             _folder: None,
         }
@@ -76,7 +76,7 @@ impl Served {
     }
 
     /// The response to a request with these lines after the first.
-    fn ask(&self, target: &str, headers: &[&str]) -> String {
+    fn get(&self, target: &str, headers: &[&str]) -> String {
         let mut stream = self.connect();
         let lines: String = headers.iter().map(|line| format!("{line}\r\n")).collect();
         let request = format!("GET {target} HTTP/1.1\r\n{lines}Connection: close\r\n\r\n");
@@ -110,14 +110,14 @@ impl Served {
     }
 
     pub fn status(&self, target: &str, headers: &[&str]) -> u32 {
-        let answer = self.ask(target, headers);
+        let answer = self.get(target, headers);
         let status = answer.split_whitespace().nth(1).and_then(|status| status.parse().ok());
         status.unwrap_or_else(|| panic!("no status: {answer:?}"))
     }
 
     /// Number of reported lines that contain `part`.
-    fn told(&self, part: &str) -> usize {
-        self.told
+    fn reported(&self, part: &str) -> usize {
+        self.reported
             .lock()
             .expect("no panic")
             .iter()
@@ -130,7 +130,7 @@ impl Served {
     }
 
     /// Asserts that a page still gets a picture.
-    pub fn draws(&self) {
+    pub fn assert_draws(&self) {
         let mut page = self.socket();
         page.send(1, SHOT.as_bytes());
         let started = Instant::now();
@@ -164,11 +164,11 @@ fn only_its_own_page_is_answered() {
     }
     assert_eq!(served.status("/", &[]), 403, "no host");
     assert_eq!(
-        (served.told("Host"), served.told("another site")),
+        (served.reported("Host"), served.reported("another site")),
         (1, 1),
         "each reason once"
     );
-    let head = served.ask("/", &[&host]).to_lowercase();
+    let head = served.get("/", &[&host]).to_lowercase();
     for header in [
         "content-security-policy: default-src 'self'",
         "x-content-type-options: nosniff",
@@ -176,7 +176,7 @@ fn only_its_own_page_is_answered() {
     ] {
         assert!(head.contains(header), "{header}");
     }
-    served.draws();
+    served.assert_draws();
 }
 
 #[test]
@@ -197,7 +197,7 @@ fn paths_lead_nowhere_but_to_the_page() {
         "/view/0/photo",
         "/view/../../photo",
     ] {
-        let answer = served.ask(target, &[&host]);
+        let answer = served.get(target, &[&host]);
         let status = answer.split_whitespace().nth(1).unwrap_or_default().to_owned();
         assert!(status == "404" || status == "400", "{target}: {status}");
     }
@@ -212,8 +212,8 @@ fn beyond_loopback_the_token_is_needed() {
     assert_eq!(served.status("/", &[&host]), 403);
     assert_eq!(served.status("/socket?token=0", &[&host]), 403);
     assert_eq!(served.status("/page/js/main.js", &[&host, "Cookie: token=1"]), 403);
-    assert_eq!(served.told("token"), 1);
-    let first = served.ask(&format!("/?token={token}"), &[&host]);
+    assert_eq!(served.reported("token"), 1);
+    let first = served.get(&format!("/?token={token}"), &[&host]);
     let cookie = first
         .lines()
         .find(|line| line.to_lowercase().starts_with("set-cookie:"))
@@ -260,8 +260,8 @@ fn garbage_and_giants_end_their_own_connection_only() {
         ended.is_ok() || ended.is_err_and(|e| e.kind() == ErrorKind::ConnectionReset),
         "no HTTP"
     );
-    assert!(served.told("was disconnected") <= 1 && served.told("protocol") <= 1);
-    served.draws();
+    assert!(served.reported("was disconnected") <= 1 && served.reported("protocol") <= 1);
+    served.assert_draws();
 }
 
 #[test]
@@ -287,12 +287,12 @@ fn a_thousand_connections_do_not_stop_the_server() {
         assert!(started.elapsed() < Duration::from_secs(60), "no answer");
         std::thread::sleep(Duration::from_millis(50));
     }
-    assert!(served.told("connections") <= 1);
-    served.draws();
+    assert!(served.reported("connections") <= 1);
+    served.assert_draws();
 }
 
 #[test]
-fn more_pages_than_seats_are_sent_away_until_one_is_free() {
+fn pages_beyond_the_limit_are_sent_away_until_one_leaves() {
     let served = serve("127.0.0.1");
     let mut pages: Vec<Socket> = (0..8).map(|_| served.socket()).collect();
     for page in &mut pages {
@@ -302,11 +302,11 @@ fn more_pages_than_seats_are_sent_away_until_one_is_free() {
         );
     }
     assert!(served.socket().is_ended());
-    assert_eq!(served.told("pages"), 1);
+    assert_eq!(served.reported("pages"), 1);
     pages.clear();
     let started = Instant::now();
     while served.viewer.is_watched() && started.elapsed() < Duration::from_secs(30) {
         std::thread::sleep(Duration::from_millis(20));
     }
-    served.draws();
+    served.assert_draws();
 }

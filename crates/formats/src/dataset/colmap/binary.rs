@@ -1,8 +1,8 @@
 //! COLMAP's `cameras.bin`, `images.bin` and `points3D.bin`, all little-endian.
 
-use super::{ColmapCamera, ColmapImage, ColmapPoint, MODELS};
+use super::{CAMERA_MODELS, ColmapCamera, ColmapImage, ColmapPoint};
 use crate::Malformed;
-use crate::bytes::Bytes;
+use crate::bytes::ByteReader;
 
 /// The id that means "no point".
 pub(super) const NO_POINT: u64 = u64::MAX;
@@ -12,12 +12,12 @@ pub(super) const NO_POINT: u64 = u64::MAX;
 /// # Errors
 /// When it is truncated, or a model's number is unknown, and therefore the length of its row.
 pub fn parse_cameras(bytes: &[u8]) -> Result<Vec<ColmapCamera>, Malformed> {
-    let mut bytes = Bytes::new(bytes);
+    let mut bytes = ByteReader::new(bytes);
     let count = bytes.count(24, "cameras")?;
     let mut cameras = Vec::with_capacity(count);
     for _ in 0..count {
         let (id, model) = (bytes.u32()?, bytes.u32()?);
-        let Some((name, params)) = MODELS.get(model as usize) else {
+        let Some((name, params)) = CAMERA_MODELS.get(model as usize) else {
             return Err(Malformed(format!(
                 "camera {id} has the model number {model}, which is not supported; run COLMAP's image_undistorter, or \
                  calibrate with OPENCV, FULL_OPENCV or OPENCV_FISHEYE"
@@ -39,7 +39,7 @@ pub fn parse_cameras(bytes: &[u8]) -> Result<Vec<ColmapCamera>, Malformed> {
 /// # Errors
 /// When it is truncated.
 pub fn parse_images(bytes: &[u8]) -> Result<Vec<ColmapImage>, Malformed> {
-    let mut bytes = Bytes::new(bytes);
+    let mut bytes = ByteReader::new(bytes);
     let count = bytes.count(4 + 7 * 8 + 4 + 1 + 8, "images")?;
     let mut images = Vec::with_capacity(count);
     for _ in 0..count {
@@ -65,7 +65,7 @@ pub fn parse_images(bytes: &[u8]) -> Result<Vec<ColmapImage>, Malformed> {
 /// # Errors
 /// When it is truncated.
 pub fn parse_points(bytes: &[u8]) -> Result<Vec<ColmapPoint>, Malformed> {
-    let mut bytes = Bytes::new(bytes);
+    let mut bytes = ByteReader::new(bytes);
     let count = bytes.count(8 + 3 * 8 + 3 + 8 + 8, "points")?;
     let mut points = Vec::with_capacity(count);
     for _ in 0..count {

@@ -5,9 +5,11 @@ pub mod binary;
 pub mod text;
 mod write;
 
-use super::beside::Beside;
-use super::declared::{Declared, DeclaredCamera, DeclaredPoints, DeclaredPose, DeclaredView, Focal, lens_or_pinhole};
+use super::declared::{
+    DeclaredCamera, DeclaredDataset, DeclaredPoints, DeclaredPose, DeclaredView, Focal, lens_or_pinhole,
+};
 use super::files::{ImageFolder, choose_image_folder, find_image};
+use super::sibling_folder::SiblingFolder;
 use crate::error::read_and_parse;
 use crate::{FormatError, Malformed};
 use glam::{DQuat, DVec3};
@@ -59,7 +61,7 @@ pub struct ColmapPoint {
 }
 
 /// The models by COLMAP's number, with their names and numbers of parameters (`models.h` of COLMAP).
-const MODELS: [(&str, usize); 18] = [
+const CAMERA_MODELS: [(&str, usize); 18] = [
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
     ("SIMPLE_RADIAL", 4),
@@ -81,7 +83,7 @@ const MODELS: [(&str, usize); 18] = [
 ];
 
 /// Maximum number of models of one folder that are considered.
-const MOST_MODELS: usize = 1000;
+const MAX_MODELS: usize = 1000;
 
 /// The folder of a model and its format.
 pub(super) struct ModelFiles {
@@ -102,7 +104,7 @@ fn model_in(folder: &Path) -> Option<ModelFiles> {
 
 /// The complete models of `sparse/0`, `sparse/1`, ..: COLMAP writes one for each part of a scene that it cannot connect.
 fn numbered_models(root: &Path) -> Vec<ModelFiles> {
-    (0..MOST_MODELS)
+    (0..MAX_MODELS)
         .map_while(|i| model_in(&root.join(format!("sparse/{i}"))))
         .collect()
 }
@@ -124,10 +126,10 @@ fn largest_model(root: &Path) -> Result<Option<(ModelFiles, Option<String>)>, Fo
         .iter()
         .map(|model| Ok(model.images()?.len()))
         .collect::<Result<_, FormatError>>()?;
-    let (most, total) = (counts.iter().copied().max().unwrap_or(0), counts.iter().sum::<usize>());
-    let largest = counts.iter().position(|count| *count == most).unwrap_or(0);
+    let (max_count, total) = (counts.iter().copied().max().unwrap_or(0), counts.iter().sum::<usize>());
+    let largest = counts.iter().position(|count| *count == max_count).unwrap_or(0);
     let warning = format!(
-        "COLMAP made {} models that it could not connect; sparse/{largest} is used, with {most} of their {total} photographs",
+        "COLMAP made {} models that it could not connect; sparse/{largest} is used, with {max_count} of their {total} photographs",
         models.len()
     );
     Ok(Some((models.swap_remove(largest), Some(warning))))
@@ -165,8 +167,8 @@ pub fn read_colmap_poses(root: &Path) -> Result<(PathBuf, Vec<ColmapCamera>, Vec
     Ok((files.folder, cameras, images))
 }
 
-pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError> {
-    let Some((files, several)) = largest_model(root)? else {
+pub(super) fn read(root: &Path, downscale: f32) -> Result<DeclaredDataset, FormatError> {
+    let Some((files, model_warning)) = largest_model(root)? else {
         return Err(FormatError::malformed(root, "contains no COLMAP model"));
     };
     let mut cameras = HashMap::new();
@@ -179,7 +181,7 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
     }
     let images = files.images()?;
     let (points, index_of) = match files.path("points3D").is_file() {
-        true => gather(files.read("points3D", binary::parse_points, text::parse_points)?),
+        true => point_cloud(files.read("points3D", binary::parse_points, text::parse_points)?),
         false => Default::default(),
     };
 
@@ -188,7 +190,7 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
         downscale,
         warning: None,
     });
-    let masks = Beside::masks(root, &folder.name);
+    let masks = SiblingFolder::masks(root, &folder.name);
     let mut views = Vec::with_capacity(images.len());
     for image in images {
         let camera = *cameras.get(&image.camera_id).ok_or_else(|| {
@@ -204,7 +206,7 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
         points_seen.dedup();
         views.push(DeclaredView {
             image: find_image(&root.join(&folder.name).join(&name)),
-            mask: masks.as_ref().and_then(|masks| masks.of(&name)),
+            mask: masks.as_ref().and_then(|masks| masks.file_of(&name)),
             name: if folder.name.is_empty() {
                 name
             } else {
@@ -221,10 +223,10 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<Declared, FormatError>
             normals: None,
         });
     }
-    let mut warnings: Vec<String> = folder.warning.into_iter().chain(several).collect();
+    let mut warnings: Vec<String> = folder.warning.into_iter().chain(model_warning).collect();
     let masked = views.iter().filter(|view| view.mask.is_some()).count();
     warnings.extend(masks.and_then(|masks| masks.mask_warning(views.len(), masked)));
-    Ok(Declared {
+    Ok(DeclaredDataset {
         kind: if files.binary {
             "COLMAP (binary)"
         } else {
@@ -254,7 +256,7 @@ fn pose(image: &ColmapImage) -> Option<DeclaredPose> {
     .checked()
 }
 
-fn gather(points: Vec<ColmapPoint>) -> (DeclaredPoints, HashMap<u64, u32>) {
+fn point_cloud(points: Vec<ColmapPoint>) -> (DeclaredPoints, HashMap<u64, u32>) {
     let mut cloud = DeclaredPoints::default();
     let mut index_of = HashMap::with_capacity(points.len());
     for point in points {
@@ -299,7 +301,10 @@ fn intrinsics(camera: &ColmapCamera) -> Result<([f64; 2], [f64; 2], Lens), Malfo
         ("FOV", &[fx, fy, cx, cy, omega]) => ([fx, fy], [cx, cy], Lens::Fov { omega }),
         ("EQUIRECTANGULAR", &[w, h]) => ([w / TAU, h / PI], [0.5 * w, 0.5 * h], Lens::Equirectangular),
         (model, params) => {
-            let count = MODELS.iter().find(|(name, _)| *name == model).map(|(_, count)| *count);
+            let count = CAMERA_MODELS
+                .iter()
+                .find(|(name, _)| *name == model)
+                .map(|(_, count)| *count);
             return Err(Malformed(match count {
                 Some(count) if count != params.len() => {
                     format!(

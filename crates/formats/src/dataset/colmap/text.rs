@@ -43,12 +43,12 @@ pub fn parse_images(bytes: &[u8]) -> Result<Vec<ColmapImage>, Malformed> {
             rotation: words.floats("QW QX QY QZ")?,
             translation: words.floats("TX TY TZ")?,
             camera_id: words.next("CAMERA_ID")?,
-            name: name_of(line).ok_or_else(|| words.wrong("NAME"))?.to_owned(),
+            name: name_of(line).ok_or_else(|| words.malformed("NAME"))?.to_owned(),
             points: Vec::new(),
         };
         if let Some((index, line)) = lines.next_if(|(_, line)| is_observations(line)) {
             let mut words = Words::new(index + 1, line);
-            while let Some(x) = words.next_if_any() {
+            while let Some(x) = words.next_word() {
                 let _: f64 = words.parse(x, "X")?;
                 words.next::<f64>("Y")?;
                 // -1 if the observation belongs to no point.
@@ -126,37 +126,37 @@ impl<'a> Words<'a> {
         }
     }
 
-    fn next_if_any(&mut self) -> Option<&'a str> {
+    fn next_word(&mut self) -> Option<&'a str> {
         self.words.next()
     }
 
-    fn next<T: FromStr>(&mut self, what: &str) -> Result<T, Malformed> {
+    fn next<T: FromStr>(&mut self, field: &str) -> Result<T, Malformed> {
         let word = self.words.next().unwrap_or("");
-        self.parse(word, what)
+        self.parse(word, field)
     }
 
-    fn floats<const N: usize>(&mut self, what: &str) -> Result<[f64; N], Malformed> {
+    fn floats<const N: usize>(&mut self, field: &str) -> Result<[f64; N], Malformed> {
         let mut values = [0.0; N];
         for value in &mut values {
-            *value = self.next(what)?;
+            *value = self.next(field)?;
         }
         Ok(values)
     }
 
-    fn rest(&mut self, what: &str) -> Result<Vec<f64>, Malformed> {
+    fn rest(&mut self, field: &str) -> Result<Vec<f64>, Malformed> {
         let mut values = Vec::new();
         while let Some(word) = self.words.next() {
-            values.push(self.parse(word, what)?);
+            values.push(self.parse(word, field)?);
         }
         Ok(values)
     }
 
-    fn parse<T: FromStr>(&self, word: &str, what: &str) -> Result<T, Malformed> {
-        word.parse().map_err(|_| self.wrong(what))
+    fn parse<T: FromStr>(&self, word: &str, field: &str) -> Result<T, Malformed> {
+        word.parse().map_err(|_| self.malformed(field))
     }
 
-    fn wrong(&self, what: &str) -> Malformed {
-        Malformed(format!("line {}: {what} is missing or not understood", self.line))
+    fn malformed(&self, field: &str) -> Malformed {
+        Malformed(format!("line {}: {field} is missing or not understood", self.line))
     }
 }
 

@@ -1,6 +1,6 @@
 //! Writes COLMAP's binary models, with keypoints and tracks.
 
-use super::{ColmapCamera, ColmapImage, ColmapPoint, MODELS};
+use super::{CAMERA_MODELS, ColmapCamera, ColmapImage, ColmapPoint};
 use crate::{FormatError, write_atomic};
 use std::io::{self, Write};
 use std::path::Path;
@@ -46,8 +46,8 @@ pub fn write_colmap(folder: &Path, model: &ColmapModel) -> Result<(), FormatErro
         .cameras
         .iter()
         .map(|camera| {
-            let known = |(name, count): &(&str, usize)| *name == camera.model && *count == camera.params.len();
-            let found = MODELS.iter().position(known);
+            let is_model = |(name, count): &(&str, usize)| *name == camera.model && *count == camera.params.len();
+            let found = CAMERA_MODELS.iter().position(is_model);
             found.map(|number| number as u32).ok_or_else(|| {
                 FormatError::Option(format!(
                     "camera {}: {} with {} parameters is not a COLMAP model",
@@ -94,8 +94,8 @@ pub fn write_colmap(folder: &Path, model: &ColmapModel) -> Result<(), FormatErro
             out.write_all(image.name.as_bytes())?;
             out.write_all(&[0])?;
             write_u64(out, keypoints.len() as u64)?;
-            for (place, point) in keypoints {
-                write_f64s(out, place)?;
+            for (position, point) in keypoints {
+                write_f64s(out, position)?;
                 write_u64(out, point.unwrap_or(super::binary::NO_POINT))?;
             }
         }

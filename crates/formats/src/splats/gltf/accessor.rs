@@ -49,7 +49,11 @@ impl Component {
 }
 
 /// The bytes of a buffer view.
-pub(super) fn view<'a>(document: &Document, buffers: &'a Buffers, index: usize) -> Result<&'a [u8], Malformed> {
+pub(super) fn buffer_view_bytes<'a>(
+    document: &Document,
+    buffers: &'a Buffers,
+    index: usize,
+) -> Result<&'a [u8], Malformed> {
     let outside = || Malformed(format!("its bufferView {index} is outside of the buffers"));
     let view = document.buffer_views.get(index).ok_or_else(outside)?;
     let buffer = buffers.get(view.buffer).ok_or_else(outside)?;
@@ -62,17 +66,23 @@ pub(super) fn view<'a>(document: &Document, buffers: &'a Buffers, index: usize) 
 impl<'a> Values<'a> {
     /// The accessor `index`, which must have `width` numbers per row.
     pub fn find(document: &Document, buffers: &'a Buffers, index: usize, width: usize) -> Result<Self, Malformed> {
-        let wrong = |what: &str| Malformed(format!("its accessor {index} {what}"));
-        let accessor = document.accessors.get(index).ok_or_else(|| wrong("does not exist"))?;
-        let component = Component::of(accessor.component_type).ok_or_else(|| wrong("has an unknown component type"))?;
+        let malformed = |reason: &str| Malformed(format!("its accessor {index} {reason}"));
+        let accessor = document
+            .accessors
+            .get(index)
+            .ok_or_else(|| malformed("does not exist"))?;
+        let component =
+            Component::of(accessor.component_type).ok_or_else(|| malformed("has an unknown component type"))?;
         let kind = ["SCALAR", "VEC2", "VEC3", "VEC4"][width - 1];
         if accessor.kind != kind {
-            return Err(wrong(&format!("is not of type {kind}")));
+            return Err(malformed(&format!("is not of type {kind}")));
         }
         let (Some(index_of_view), true) = (accessor.buffer_view, accessor.sparse.is_null()) else {
-            return Err(wrong("is sparse or has no values, which is not supported for splats"));
+            return Err(malformed(
+                "is sparse or has no values, which is not supported for splats",
+            ));
         };
-        let bytes = view(document, buffers, index_of_view)?;
+        let bytes = buffer_view_bytes(document, buffers, index_of_view)?;
         let row = width * component.size();
         let stride = document.buffer_views[index_of_view].byte_stride.unwrap_or(row as u64);
         let needed = match accessor.count {
@@ -80,7 +90,7 @@ impl<'a> Values<'a> {
             count => u128::from(count - 1) * u128::from(stride) + row as u128 + u128::from(accessor.byte_offset),
         };
         if stride < row as u64 || needed > bytes.len() as u128 {
-            return Err(wrong(&format!(
+            return Err(malformed(&format!(
                 "declares {} rows, and its bufferView of {} bytes holds fewer",
                 accessor.count,
                 bytes.len()
@@ -103,7 +113,7 @@ impl<'a> Values<'a> {
             let at = c * self.component.size();
             let pair = || [row[at], row[at + 1]];
             let four = || [row[at], row[at + 1], row[at + 2], row[at + 3]];
-            let (value, largest) = match self.component {
+            let (value, max) = match self.component {
                 Component::I8 => (f32::from(row[at] as i8), 127.0),
                 Component::U8 => (f32::from(row[at]), 255.0),
                 Component::I16 => (f32::from(i16::from_le_bytes(pair())), 32767.0),
@@ -112,7 +122,7 @@ impl<'a> Values<'a> {
                 Component::F32 => return f32::from_le_bytes(four()),
             };
             if self.normalized {
-                (value / largest).max(-1.0)
+                (value / max).max(-1.0)
             } else {
                 value
             }

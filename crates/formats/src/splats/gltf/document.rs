@@ -85,10 +85,10 @@ impl Primitive {
 
     /// The buffer view of its splats if they are packed as SPZ: within the extension, or, in the first drafts, beside it.
     pub fn spz(&self) -> Option<u64> {
-        let places = [&self.extensions[EXTENSION]["extensions"], &self.extensions];
-        let found = places
+        let locations = [&self.extensions[EXTENSION]["extensions"], &self.extensions];
+        let found = locations
             .iter()
-            .flat_map(|place| SPZ_EXTENSIONS.map(|name| &place[name]["bufferView"]));
+            .flat_map(|location| SPZ_EXTENSIONS.map(|name| &location[name]["bufferView"]));
         found.into_iter().find_map(Value::as_u64)
     }
 

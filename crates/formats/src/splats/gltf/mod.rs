@@ -22,12 +22,12 @@ const SPZ_EXTENSIONS: [&str; 3] = [
     "KHR_spz_gaussian_splats_compression",
 ];
 /// First words of a `.glb` file and of its two chunks.
-const GLB: u32 = u32::from_le_bytes(*b"glTF");
+const GLB_MAGIC: u32 = u32::from_le_bytes(*b"glTF");
 const JSON_CHUNK: u32 = u32::from_le_bytes(*b"JSON");
 const BIN_CHUNK: u32 = u32::from_le_bytes(*b"BIN\0");
 
 /// The attribute of a coefficient, DC included.
-fn harmonic(coefficient: usize) -> String {
+fn sh_attribute(coefficient: usize) -> String {
     let degree = coefficient.isqrt();
     format!("{EXTENSION}:SH_DEGREE_{degree}_COEF_{}", coefficient - degree * degree)
 }

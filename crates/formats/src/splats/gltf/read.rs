@@ -1,7 +1,7 @@
-use super::accessor::{Buffers, Values, view};
+use super::accessor::{Buffers, Values, buffer_view_bytes};
 use super::document::{Document, Primitive};
-use super::{BIN_CHUNK, EXTENSION, GLB, JSON_CHUNK, SPZ_EXTENSIONS, harmonic};
-use crate::bytes::Bytes;
+use super::{BIN_CHUNK, EXTENSION, GLB_MAGIC, JSON_CHUNK, SPZ_EXTENSIONS, sh_attribute};
+use crate::bytes::ByteReader;
 use crate::splats::axes::{Affine, Signs};
 use crate::splats::quantize::logit;
 use crate::splats::rows::{decode_splats, plausible_count};
@@ -12,15 +12,15 @@ use rayon::prelude::*;
 use std::borrow::Cow;
 
 /// Extensions that a document may require.
-const KNOWN: [&str; 2] = [EXTENSION, "KHR_mesh_quantization"];
+const SUPPORTED_EXTENSIONS: [&str; 2] = [EXTENSION, "KHR_mesh_quantization"];
 
 /// Parses a `.glb` file.
 ///
 /// # Errors
 /// When it is damaged, requires an unknown extension, has no splats, or refers to something that it does not contain.
 pub fn parse_glb(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
-    let mut rest = Bytes::new(bytes);
-    if rest.u32()? != GLB {
+    let mut rest = ByteReader::new(bytes);
+    if rest.u32()? != GLB_MAGIC {
         return Err(Malformed("not a .glb file: it does not begin with glTF".into()));
     }
     let (version, length) = (rest.u32()?, rest.u32()? as usize);
@@ -44,7 +44,7 @@ pub fn parse_glb(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     parse(text, binary, bytes.len(), &|name| {
         Err(Malformed(format!(
             "its buffer {} is in another file; convert it to a .glb that contains its buffers",
-            zip::shown(name)
+            zip::printable(name)
         )))
     })
 }
@@ -65,11 +65,12 @@ fn parse(
 ) -> Result<GaussianCloud, Malformed> {
     let document: Document = serde_json::from_slice(text)
         .map_err(|error| Malformed(format!("its JSON is not that of glTF 2.0: {error}")))?;
-    let is_known = |name: &&String| KNOWN.contains(&name.as_str()) || SPZ_EXTENSIONS.contains(&name.as_str());
-    if let Some(unknown) = document.extensions_required.iter().find(|name| !is_known(name)) {
+    let is_supported =
+        |name: &&String| SUPPORTED_EXTENSIONS.contains(&name.as_str()) || SPZ_EXTENSIONS.contains(&name.as_str());
+    if let Some(unknown) = document.extensions_required.iter().find(|name| !is_supported(name)) {
         return Err(Malformed(format!(
             "requires the extension {}, which is not supported",
-            zip::shown(unknown)
+            zip::printable(unknown)
         )));
     }
     let mut buffers: Vec<Cow<[u8]>> = Vec::new();
@@ -148,14 +149,14 @@ fn placed_primitives(document: &Document) -> Result<Vec<(&Primitive, Affine)>, M
                 "its node {index} has two parents; nodes form a tree"
             )));
         }
-        let place = parent.after(node.transform());
+        let transform = parent.after(node.transform());
         if let Some(mesh) = node.mesh {
             let mesh = document.meshes.get(mesh);
             let mesh = mesh.ok_or_else(|| Malformed(format!("the mesh of its node {index} does not exist")))?;
             let splats = mesh.primitives.iter().filter(|primitive| primitive.has_splats());
-            placed.extend(splats.map(|primitive| (primitive, place)));
+            placed.extend(splats.map(|primitive| (primitive, transform)));
         }
-        stack.extend(node.children.iter().rev().map(|child| (*child, place)));
+        stack.extend(node.children.iter().rev().map(|child| (*child, transform)));
     }
     Ok(placed)
 }
@@ -164,7 +165,7 @@ fn placed_primitives(document: &Document) -> Result<Vec<(&Primitive, Affine)>, M
 fn decode(document: &Document, buffers: &Buffers, primitive: &Primitive) -> Result<GaussianCloud, Malformed> {
     if let Some(index) = primitive.spz() {
         let index = usize::try_from(index).unwrap_or(usize::MAX);
-        let mut cloud = spz::parse(view(document, buffers, index)?)?;
+        let mut cloud = spz::parse(buffer_view_bytes(document, buffers, index)?)?;
         Signs::HALF_TURN_Z.apply(&mut cloud);
         return Ok(cloud);
     }
@@ -175,19 +176,19 @@ fn decode(document: &Document, buffers: &Buffers, primitive: &Primitive) -> Resu
         }
         None => Err(Malformed(format!("its splats lack the attribute {name}"))),
     };
-    let own = |name: &str| format!("{EXTENSION}:{name}");
+    let attribute_name = |name: &str| format!("{EXTENSION}:{name}");
     let positions = attribute("POSITION", 3)?;
-    let rotations = attribute(&own("ROTATION"), 4)?;
-    let scales = attribute(&own("SCALE"), 3)?;
-    let opacities = attribute(&own("OPACITY"), 1)?;
-    let has = |degree: &u32| {
+    let rotations = attribute(&attribute_name("ROTATION"), 4)?;
+    let scales = attribute(&attribute_name("SCALE"), 3)?;
+    let opacities = attribute(&attribute_name("OPACITY"), 1)?;
+    let has_degree = |degree: &u32| {
         primitive
             .attributes
-            .contains_key(&harmonic(sh::coefficients(*degree) - 1))
+            .contains_key(&sh_attribute(sh::coefficients(*degree) - 1))
     };
-    let degree = (0..=3).rev().find(has).unwrap_or(0);
+    let degree = (0..=3).rev().find(has_degree).unwrap_or(0);
     let harmonics = (0..sh::coefficients(degree))
-        .map(|coefficient| attribute(&harmonic(coefficient), 3))
+        .map(|coefficient| attribute(&sh_attribute(coefficient), 3))
         .collect::<Result<Vec<_>, _>>()?;
     let count = positions.count;
     let others = [&rotations, &scales, &opacities];
@@ -198,7 +199,7 @@ fn decode(document: &Document, buffers: &Buffers, primitive: &Primitive) -> Resu
     }
     plausible_count(count as u64, buffers.iter().map(|buffer| buffer.len()).sum())?;
     // A negative scale, which the extension forbids, marks a file of an earlier draft, which stored ln.
-    let is_ln = (0..count)
+    let is_log_scale = (0..count)
         .into_par_iter()
         .any(|i| scales.row::<3>(i).iter().any(|scale| *scale < 0.0));
     Ok(decode_splats(count, degree, |i, splat| {
@@ -206,7 +207,7 @@ fn decode(document: &Document, buffers: &Buffers, primitive: &Primitive) -> Resu
         let [x, y, z, w] = rotations.row(i);
         *splat.quat = [w, x, y, z];
         let scale: [f32; 3] = scales.row(i);
-        *splat.log_scale = if is_ln { scale } else { scale.map(f32::ln) };
+        *splat.log_scale = if is_log_scale { scale } else { scale.map(f32::ln) };
         let [opacity] = opacities.row(i);
         *splat.opacity_logit = logit(opacity);
         for (to, values) in splat.sh.chunks_exact_mut(3).zip(&harmonics) {

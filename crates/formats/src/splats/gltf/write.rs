@@ -1,14 +1,14 @@
-use super::{BIN_CHUNK, EXTENSION, GLB, JSON_CHUNK, SPZ_EXTENSIONS, harmonic};
+use super::{BIN_CHUNK, EXTENSION, GLB_MAGIC, JSON_CHUNK, SPZ_EXTENSIONS, sh_attribute};
 use crate::splats::axes::Signs;
 use crate::splats::quantize::{normalized, sigmoid};
-use crate::splats::rows::{CHUNK, bounds, encode_rows};
+use crate::splats::rows::{SPLATS_PER_TASK, bounds, encode_rows};
 use crate::splats::{Quality, SpzVersion, spz};
 use irradia_scene::{GaussianCloud, base64, sh};
 use serde_json::{Map, Value, json};
 use std::io::{self, Write};
 
 /// glTF's codes of a component type and of a buffer view's target.
-const FLOAT: u32 = 5126;
+const FLOAT_COMPONENT: u32 = 5126;
 const ARRAY_BUFFER: u32 = 34962;
 
 /// Writes the numbers of a splat.
@@ -32,7 +32,7 @@ fn attributes(cloud: &GaussianCloud) -> Vec<Attribute<'_>> {
         width,
         values,
     };
-    let own = |name: &str| format!("{EXTENSION}:{name}");
+    let attribute_name = |name: &str| format!("{EXTENSION}:{name}");
     let mut all = vec![
         attribute(
             "POSITION".into(),
@@ -43,7 +43,7 @@ fn attributes(cloud: &GaussianCloud) -> Vec<Attribute<'_>> {
             }) as Values,
         ),
         attribute(
-            own("ROTATION"),
+            attribute_name("ROTATION"),
             "VEC4",
             4,
             Box::new(move |i, to: &mut [f32]| {
@@ -52,7 +52,7 @@ fn attributes(cloud: &GaussianCloud) -> Vec<Attribute<'_>> {
             }),
         ),
         attribute(
-            own("SCALE"),
+            attribute_name("SCALE"),
             "VEC3",
             3,
             Box::new(move |i, to: &mut [f32]| {
@@ -60,7 +60,7 @@ fn attributes(cloud: &GaussianCloud) -> Vec<Attribute<'_>> {
             }),
         ),
         attribute(
-            own("OPACITY"),
+            attribute_name("OPACITY"),
             "SCALAR",
             1,
             Box::new(move |i, to: &mut [f32]| {
@@ -75,13 +75,13 @@ fn attributes(cloud: &GaussianCloud) -> Vec<Attribute<'_>> {
             let from = &cloud.sh[i * width + 3 * coefficient..];
             to.iter_mut().zip(from).for_each(|(to, from)| *to = from * sign);
         });
-        all.push(attribute(harmonic(coefficient), "VEC3", 3, values));
+        all.push(attribute(sh_attribute(coefficient), "VEC3", 3, values));
     }
     all
 }
 
 /// The document of one mesh whose primitive is `primitive`.
-fn document(primitive: Value, extensions: &[&str], required: &[&str], buffer: Value, parts: &[Value]) -> Value {
+fn document(primitive: Value, extensions: &[&str], required: &[&str], buffer: Value, buffer_views: &[Value]) -> Value {
     let mut document = json!({
         "asset": { "version": "2.0", "generator": "Irradia" },
         "extensionsUsed": extensions,
@@ -90,7 +90,7 @@ fn document(primitive: Value, extensions: &[&str], required: &[&str], buffer: Va
         "nodes": [{ "mesh": 0 }],
         "meshes": [{ "primitives": [primitive] }],
         "buffers": [buffer],
-        "bufferViews": parts,
+        "bufferViews": buffer_views,
     });
     if !required.is_empty() {
         document["extensionsRequired"] = json!(required);
@@ -98,7 +98,7 @@ fn document(primitive: Value, extensions: &[&str], required: &[&str], buffer: Va
     document
 }
 
-fn splatting() -> Value {
+fn extension_json() -> Value {
     json!({
         "kernel": "ellipse",
         "colorSpace": "srgb_rec709_display",
@@ -117,7 +117,8 @@ fn plain_document(cloud: &GaussianCloud, attributes: &[Attribute], mut buffer: V
     for (i, attribute) in attributes.iter().enumerate() {
         let length = 4 * attribute.width * count;
         views.push(json!({ "buffer": 0, "byteOffset": offset, "byteLength": length, "target": ARRAY_BUFFER }));
-        let mut accessor = json!({ "bufferView": i, "componentType": FLOAT, "count": count, "type": attribute.kind });
+        let mut accessor =
+            json!({ "bufferView": i, "componentType": FLOAT_COMPONENT, "count": count, "type": attribute.kind });
         if i == 0 {
             let corner = |pick: fn(f32, f32) -> f32| [0, 1, 2].map(|c| pick(a[c], b[c]));
             accessor["min"] = json!(corner(f32::min));
@@ -128,7 +129,7 @@ fn plain_document(cloud: &GaussianCloud, attributes: &[Attribute], mut buffer: V
         offset += length;
     }
     buffer["byteLength"] = json!(offset);
-    let primitive = json!({ "attributes": names, "mode": 0, "extensions": { EXTENSION: splatting() } });
+    let primitive = json!({ "attributes": names, "mode": 0, "extensions": { EXTENSION: extension_json() } });
     let mut document = document(primitive, &[EXTENSION], &[], buffer, &views);
     document["accessors"] = json!(accessors);
     document
@@ -138,8 +139,8 @@ fn plain_document(cloud: &GaussianCloud, attributes: &[Attribute], mut buffer: V
 fn write_attributes(out: &mut dyn Write, count: usize, attributes: &[Attribute]) -> io::Result<()> {
     for attribute in attributes {
         let row = 4 * attribute.width;
-        for first in (0..count).step_by(16 * CHUNK) {
-            let bytes = encode_rows((count - first).min(16 * CHUNK), row, |i, row| {
+        for first in (0..count).step_by(16 * SPLATS_PER_TASK) {
+            let bytes = encode_rows((count - first).min(16 * SPLATS_PER_TASK), row, |i, row| {
                 let mut values = [0.0; 4];
                 (attribute.values)(first + i, &mut values[..attribute.width]);
                 for (to, value) in row.chunks_exact_mut(4).zip(values) {
@@ -153,12 +154,12 @@ fn write_attributes(out: &mut dyn Write, count: usize, attributes: &[Attribute])
 }
 
 /// Header, JSON chunk and the head of the binary chunk of a `.glb` file with `binary` bytes, a multiple of four.
-fn write_glb_head(out: &mut dyn Write, document: &Value, binary: usize) -> io::Result<()> {
+fn write_glb_header(out: &mut dyn Write, document: &Value, binary: usize) -> io::Result<()> {
     let mut text = serde_json::to_vec(document)?;
     text.resize(text.len().next_multiple_of(4), b' ');
     let total = u32::try_from(28 + text.len() + binary)
         .map_err(|_| io::Error::other("a .glb file holds at most 4 GiB; choose another format"))?;
-    for word in [GLB, 2, total, text.len() as u32, JSON_CHUNK] {
+    for word in [GLB_MAGIC, 2, total, text.len() as u32, JSON_CHUNK] {
         out.write_all(&word.to_le_bytes())?;
     }
     out.write_all(&text)?;
@@ -171,7 +172,7 @@ pub(crate) fn write_glb(out: &mut dyn Write, cloud: &GaussianCloud) -> io::Resul
     let attributes = attributes(cloud);
     let document = plain_document(cloud, &attributes, json!({}));
     let floats: usize = attributes.iter().map(|attribute| attribute.width).sum();
-    write_glb_head(out, &document, 4 * floats * cloud.len())?;
+    write_glb_header(out, &document, 4 * floats * cloud.len())?;
     write_attributes(out, cloud.len(), &attributes)
 }
 
@@ -188,13 +189,13 @@ pub(crate) fn write_gltf(out: &mut dyn Write, cloud: &GaussianCloud) -> io::Resu
 /// Writes `cloud` as an SPZ file of version 2, which the extension requires, in a `.glb`.
 pub(crate) fn write_glb_spz(out: &mut dyn Write, cloud: &GaussianCloud, quality: Quality) -> io::Result<()> {
     let mut packed = spz::encode(cloud, quality, SpzVersion::V2);
-    let mut extension = splatting();
+    let mut extension = extension_json();
     extension["extensions"] = json!({ SPZ_EXTENSIONS[0]: { "bufferView": 0 } });
     let primitive = json!({ "attributes": {}, "mode": 0, "extensions": { EXTENSION: extension } });
     let used = [EXTENSION, SPZ_EXTENSIONS[0]];
     let views = [json!({ "buffer": 0, "byteLength": packed.len() })];
     let document = document(primitive, &used, &used, json!({ "byteLength": packed.len() }), &views);
     packed.resize(packed.len().next_multiple_of(4), 0);
-    write_glb_head(out, &document, packed.len())?;
+    write_glb_header(out, &document, packed.len())?;
     out.write_all(&packed)
 }

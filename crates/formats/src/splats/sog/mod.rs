@@ -12,12 +12,12 @@ mod read;
 mod write;
 
 pub use read::parse_zip as parse;
-pub(crate) use read::{MAX_META, is_meta, read_folder};
+pub(crate) use read::{MAX_META_BYTES, is_meta, read_folder};
 pub(crate) use write::{encode, write};
 
 /// The file that describes the others.
-pub(crate) const META: &str = "meta.json";
+pub(crate) const META_FILE: &str = "meta.json";
 /// Palette entries in a row of the image of centroids.
-const ROW: usize = 64;
+const ENTRIES_PER_ROW: usize = 64;
 /// Fourth byte of a quaternion whose largest component is w; the values for x, y and z follow.
 const LARGEST_W: u8 = 252;

@@ -1,7 +1,7 @@
 //! Codebooks of 256 numbers that stand for all numbers, and palettes of vectors that stand for all vectors. Both minimise the squared
 //! error by Lloyd's method, start from the data's own order and sum in a fixed order, so that equal scenes give equal files.
 
-use crate::splats::rows::CHUNK;
+use crate::splats::rows::SPLATS_PER_TASK;
 use rayon::prelude::*;
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
@@ -11,11 +11,11 @@ const BINS: usize = 1 << 16;
 /// Bins by which their density is estimated: few, so that each holds many numbers.
 const DENSITY_BINS: usize = 512;
 /// Rounds of Lloyd's method; later ones change little.
-const ROUNDS_OF_NUMBERS: usize = 30;
-const ROUNDS_OF_COARSE: usize = 10;
-const ROUNDS_OF_FINE: usize = 8;
+const CODEBOOK_ROUNDS: usize = 30;
+const COARSE_ROUNDS: usize = 10;
+const FINE_ROUNDS: usize = 8;
 /// Maximum number of vectors from which the coarse clusters are found.
-const SAMPLE: usize = 1 << 16;
+const MAX_SAMPLES: usize = 1 << 16;
 /// Centroids compared at a time: the compiler vectorises over them.
 const LANES: usize = 16;
 
@@ -41,8 +41,8 @@ impl Codebook {
             bin.1 += f64::from(v);
         }
         bins.retain(|(count, _)| *count > 0);
-        let mut numbers = Self::first(&bins, low.into(), high.into(), count);
-        for _ in 0..ROUNDS_OF_NUMBERS {
+        let mut numbers = Self::initial_numbers(&bins, low.into(), high.into(), count);
+        for _ in 0..CODEBOOK_ROUNDS {
             let mut sums = [(0u64, 0f64); 256];
             let mut nearest = 0;
             for (members, sum) in &bins {
@@ -81,24 +81,24 @@ impl Codebook {
     }
 
     /// Initial numbers: the quantiles of the cube root of the density, which are optimal for many numbers (Panter and Dite 1951).
-    fn first(bins: &[(u64, f64)], low: f64, high: f64, count: usize) -> Vec<f64> {
+    fn initial_numbers(bins: &[(u64, f64)], low: f64, high: f64, count: usize) -> Vec<f64> {
         let mut density = [0u64; DENSITY_BINS];
         let width = (high - low) / DENSITY_BINS as f64;
         for (count, sum) in bins {
-            let place = (sum / *count as f64 - low) / width;
-            density[(place as usize).min(DENSITY_BINS - 1)] += count;
+            let bin = (sum / *count as f64 - low) / width;
+            density[(bin as usize).min(DENSITY_BINS - 1)] += count;
         }
         let weights = density.map(|count| (count as f64).cbrt());
         let total: f64 = weights.iter().sum();
         let mut numbers = Vec::with_capacity(count);
-        let mut below = 0.0;
+        let mut cumulative = 0.0;
         for (i, weight) in weights.into_iter().enumerate() {
             let quantile = |found: usize| (found as f64 + 0.5) / count as f64 * total;
-            while numbers.len() < count && quantile(numbers.len()) <= below + weight {
-                let part = (quantile(numbers.len()) - below) / weight;
-                numbers.push(low + (i as f64 + part) * width);
+            while numbers.len() < count && quantile(numbers.len()) <= cumulative + weight {
+                let fraction = (quantile(numbers.len()) - cumulative) / weight;
+                numbers.push(low + (i as f64 + fraction) * width);
             }
-            below += weight;
+            cumulative += weight;
         }
         numbers.resize(count, high);
         numbers
@@ -127,9 +127,9 @@ pub(super) struct Palette {
 }
 
 impl Palette {
-    /// At most `most` entries (2 to 65,536) for `vectors` of `width` numbers: all distinct ones if they are few enough.
-    pub fn of(vectors: &[f32], width: usize, most: usize) -> Self {
-        if let Some(exact) = Self::exact(vectors, width, most) {
+    /// At most `max_entries` entries (2 to 65,536) for `vectors` of `width` numbers: all distinct ones if they are few enough.
+    pub fn of(vectors: &[f32], width: usize, max_entries: usize) -> Self {
+        if let Some(exact) = Self::exact(vectors, width, max_entries) {
             return exact;
         }
         // Vectors of zeros, of splats whose harmonics do not show, share one entry; otherwise many centroids would start there.
@@ -137,14 +137,14 @@ impl Palette {
         let (zero, other): (Vec<usize>, Vec<usize>) =
             (0..vectors.len() / width).partition(|i| is_zero(&vectors[i * width..(i + 1) * width]));
         if zero.is_empty() {
-            return Self::clustered(vectors, width, most);
+            return Self::clustered(vectors, width, max_entries);
         }
         let others: Vec<f32> = other
             .iter()
             .flat_map(|i| &vectors[i * width..(i + 1) * width])
             .copied()
             .collect();
-        let clustered = Self::clustered(&others, width, most - 1);
+        let clustered = Self::clustered(&others, width, max_entries - 1);
         let mut palette = Self {
             entries: vec![0.0; width],
             labels: vec![0; vectors.len() / width],
@@ -156,15 +156,15 @@ impl Palette {
         palette
     }
 
-    /// The distinct vectors, in the order of their first use, if there are at most `most`.
-    fn exact(vectors: &[f32], width: usize, most: usize) -> Option<Self> {
+    /// The distinct vectors, in the order of their first use, if there are at most `max_entries`.
+    fn exact(vectors: &[f32], width: usize, max_entries: usize) -> Option<Self> {
         let mut known: HashMap<Vec<u32>, u16> = HashMap::new();
         let (mut entries, mut labels) = (Vec::new(), Vec::with_capacity(vectors.len() / width));
         for vector in vectors.chunks_exact(width) {
             let next = known.len();
             let label = match known.entry(vector.iter().map(|v| v.to_bits()).collect()) {
                 Entry::Occupied(known) => *known.get(),
-                Entry::Vacant(_) if next == most => return None,
+                Entry::Vacant(_) if next == max_entries => return None,
                 Entry::Vacant(new) => {
                     entries.extend_from_slice(vector);
                     *new.insert(next as u16)
@@ -177,23 +177,29 @@ impl Palette {
 
     /// Entries by clustering.
     ///
-    /// In two steps: first as many coarse clusters as the square root of `most`, then the entries within each, in a number that follows
-    /// its share of the error. This compares a vector with hundreds of centroids, where one step would compare it with tens of thousands.
-    fn clustered(vectors: &[f32], width: usize, most: usize) -> Self {
+    /// In two steps: first as many coarse clusters as the square root of `max_entries`, then the entries within each, in a number that
+    /// follows its share of the error. This compares a vector with hundreds of centroids, where one step would compare it with tens of thousands.
+    fn clustered(vectors: &[f32], width: usize, max_entries: usize) -> Self {
         let count = vectors.len() / width;
-        if count <= most {
+        if count <= max_entries {
             return Self {
                 entries: vectors.to_vec(),
                 labels: (0..count).map(|i| i as u16).collect(),
             };
         }
         let vector = |i: usize| &vectors[i * width..(i + 1) * width];
-        let step = count.div_ceil(SAMPLE);
+        let step = count.div_ceil(MAX_SAMPLES);
         let sample: Vec<u32> = (0..count as u32).step_by(step).collect();
-        let coarse = lloyd(vectors, width, &sample, (most as f64).sqrt() as usize, ROUNDS_OF_COARSE);
+        let coarse = lloyd(
+            vectors,
+            width,
+            &sample,
+            (max_entries as f64).sqrt() as usize,
+            COARSE_ROUNDS,
+        );
         let nearest: Vec<(u32, f32)> = (0..count)
             .into_par_iter()
-            .with_min_len(CHUNK / 16)
+            .with_min_len(SPLATS_PER_TASK / 16)
             .map(|i| coarse.nearest(vector(i)))
             .collect();
         let mut members = vec![Vec::new(); coarse.count];
@@ -202,13 +208,13 @@ impl Palette {
             members[cluster as usize].push(i as u32);
             errors[cluster as usize] += f64::from(error.max(0.0));
         }
-        let shares = shares(&members, &errors, most);
+        let shares = entries_per_cluster(&members, &errors, max_entries);
         let fine: Vec<(Centroids, Vec<u32>)> = members
             .par_iter()
             .zip(shares)
             .with_max_len(1)
             .map(|(members, share)| {
-                let centroids = lloyd(vectors, width, members, share, ROUNDS_OF_FINE);
+                let centroids = lloyd(vectors, width, members, share, FINE_ROUNDS);
                 let labels = members
                     .iter()
                     .map(|i| centroids.nearest(vector(*i as usize)).0)
@@ -217,7 +223,7 @@ impl Palette {
             })
             .collect();
         let mut palette = Self {
-            entries: Vec::with_capacity(most * width),
+            entries: Vec::with_capacity(max_entries * width),
             labels: vec![0; count],
         };
         for ((centroids, labels), members) in fine.iter().zip(&members) {
@@ -231,12 +237,12 @@ impl Palette {
     }
 }
 
-/// Number of entries of each cluster, at most `most` in total: one each, and the rest by its error and number of members, but never more
-/// than it has members.
-fn shares(members: &[Vec<u32>], errors: &[f64], most: usize) -> Vec<usize> {
+/// Number of entries of each cluster, at most `max_entries` in total: one each, and the rest by its error and number of members, but never
+/// more than it has members.
+fn entries_per_cluster(members: &[Vec<u32>], errors: &[f64], max_entries: usize) -> Vec<usize> {
     let total: f64 = errors.iter().sum::<f64>().max(f64::MIN_POSITIVE);
     let count: usize = members.iter().map(Vec::len).sum();
-    let spare = (most - members.len().min(most)) as f64;
+    let spare = (max_entries - members.len().min(max_entries)) as f64;
     let share = |(members, error): (&Vec<u32>, &f64)| {
         let part = 0.5 * error / total + 0.5 * members.len() as f64 / count as f64;
         (1 + (part * spare) as usize).min(members.len())
@@ -250,24 +256,24 @@ struct Centroids {
     width: usize,
     blocks: Vec<[f32; LANES]>,
     /// Half the squared length of each; infinite in unused lanes.
-    halves: Vec<[f32; LANES]>,
+    half_norms: Vec<[f32; LANES]>,
 }
 
 impl Centroids {
     fn new(width: usize, centroids: &[Vec<f32>]) -> Self {
         let mut blocks = vec![[0.0; LANES]; centroids.len().div_ceil(LANES) * width];
-        let mut halves = vec![[f32::INFINITY; LANES]; centroids.len().div_ceil(LANES)];
+        let mut half_norms = vec![[f32::INFINITY; LANES]; centroids.len().div_ceil(LANES)];
         for (i, centroid) in centroids.iter().enumerate() {
             for (k, value) in centroid.iter().enumerate() {
                 blocks[i / LANES * width + k][i % LANES] = *value;
             }
-            halves[i / LANES][i % LANES] = 0.5 * centroid.iter().map(|v| v * v).sum::<f32>();
+            half_norms[i / LANES][i % LANES] = 0.5 * centroid.iter().map(|v| v * v).sum::<f32>();
         }
         Self {
             count: centroids.len(),
             width,
             blocks,
-            halves,
+            half_norms,
         }
     }
 
@@ -278,10 +284,10 @@ impl Centroids {
 
     /// The nearest centroid, and the squared distance to it.
     fn nearest(&self, vector: &[f32]) -> (u32, f32) {
-        let (mut best, mut at) = (f32::INFINITY, 0);
-        for (block, (numbers, halves)) in self.blocks.chunks_exact(self.width).zip(&self.halves).enumerate() {
+        let (mut best, mut best_index) = (f32::INFINITY, 0);
+        for (block, (numbers, half_norms)) in self.blocks.chunks_exact(self.width).zip(&self.half_norms).enumerate() {
             // Half the squared distance, less half the squared length of the vector.
-            let mut distances = *halves;
+            let mut distances = *half_norms;
             for (value, lanes) in vector.iter().zip(numbers) {
                 for (distance, number) in distances.iter_mut().zip(lanes) {
                     *distance -= value * number;
@@ -289,11 +295,14 @@ impl Centroids {
             }
             for (lane, distance) in distances.into_iter().enumerate() {
                 if distance < best {
-                    (best, at) = (distance, block * LANES + lane);
+                    (best, best_index) = (distance, block * LANES + lane);
                 }
             }
         }
-        (at as u32, 2.0 * best + vector.iter().map(|v| v * v).sum::<f32>())
+        (
+            best_index as u32,
+            2.0 * best + vector.iter().map(|v| v * v).sum::<f32>(),
+        )
     }
 }
 

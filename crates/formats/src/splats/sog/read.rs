@@ -1,4 +1,4 @@
-use super::{LARGEST_W, META, ROW};
+use super::{ENTRIES_PER_ROW, LARGEST_W, META_FILE};
 use crate::splats::quantize::{from_smallest_three, logits_of_bytes};
 use crate::splats::rows::{decode_splats, plausible_count};
 use crate::{FormatError, Malformed, zip};
@@ -12,7 +12,7 @@ use std::io::Cursor;
 use std::path::Path;
 
 /// `meta.json` holds a few codebooks of 256 numbers.
-pub(crate) const MAX_META: usize = 1 << 20;
+pub(crate) const MAX_META_BYTES: usize = 1 << 20;
 /// Pixels that an image may have beyond four per splat: writers round its sides up.
 const SPARE_PIXELS: usize = 65_536;
 /// Maximum number of entries of a palette: labels have 16 bits.
@@ -66,18 +66,18 @@ pub fn parse_zip(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     let files = zip::files(bytes)?;
     // Some tools put a folder around the files.
     let is_meta = |name: &&String| {
-        name.strip_suffix(META)
+        name.strip_suffix(META_FILE)
             .is_some_and(|rest| rest.is_empty() || rest.ends_with('/'))
     };
     let meta = files.keys().filter(is_meta).min_by_key(|name| name.len());
-    let meta = meta.ok_or_else(|| Malformed(format!("the archive contains no {META}; it is not a SOG scene")))?;
-    let folder = &meta[..meta.len() - META.len()];
-    let most = bytes.len().saturating_mul(64).max(1 << 20);
+    let meta = meta.ok_or_else(|| Malformed(format!("the archive contains no {META_FILE}; it is not a SOG scene")))?;
+    let folder = &meta[..meta.len() - META_FILE.len()];
+    let max_bytes = bytes.len().saturating_mul(64).max(1 << 20);
     let get = |name: &str| -> Result<Cow<[u8]>, Malformed> {
         let entry = files.get(&format!("{folder}{name}"));
-        let entry = entry.ok_or_else(|| Malformed(format!("the archive contains no {}", zip::shown(name))))?;
-        let content = entry.content(if name == META { MAX_META } else { most });
-        content.map_err(|error| Malformed(format!("{}: {error}", zip::shown(name))))
+        let entry = entry.ok_or_else(|| Malformed(format!("the archive contains no {}", zip::printable(name))))?;
+        let content = entry.content(if name == META_FILE { MAX_META_BYTES } else { max_bytes });
+        content.map_err(|error| Malformed(format!("{}: {error}", zip::printable(name))))
     };
     parse(&get)
 }
@@ -89,12 +89,12 @@ pub(crate) fn read_folder(meta: &Path) -> Result<GaussianCloud, FormatError> {
     let mut contents = HashMap::new();
     let text = crate::error::read_file(meta)?;
     let mut read_all = || -> Result<(), Malformed> {
-        for name in names(&parse_meta(&text)?) {
+        for name in file_names(&parse_meta(&text)?) {
             // A file may only refer to files in its folder.
             if name.contains(['/', '\\', ':']) || name.starts_with("..") {
                 return Err(Malformed(format!(
                     "refers to the image {}, which is not a file beside it",
-                    zip::shown(name)
+                    zip::printable(name)
                 )));
             }
             match crate::error::read_file(&folder.join(name)) {
@@ -107,13 +107,13 @@ pub(crate) fn read_folder(meta: &Path) -> Result<GaussianCloud, FormatError> {
         }
         Ok(())
     };
-    let named = read_all();
+    let result = read_all();
     if let Some(error) = unreadable {
         return Err(error);
     }
-    let parsed = named.and_then(|()| {
+    let parsed = result.and_then(|()| {
         parse(&|name| match name {
-            META => Ok(Cow::Borrowed(&text)),
+            META_FILE => Ok(Cow::Borrowed(&text)),
             _ => Ok(Cow::Borrowed(&contents[name])),
         })
     });
@@ -125,7 +125,7 @@ pub(crate) fn read_folder(meta: &Path) -> Result<GaussianCloud, FormatError> {
 
 fn parse_meta(text: &[u8]) -> Result<Meta, Malformed> {
     let meta: Meta = serde_json::from_slice(text)
-        .map_err(|error| Malformed(format!("{META} is not that of a SOG scene: {error}")))?;
+        .map_err(|error| Malformed(format!("{META_FILE} is not that of a SOG scene: {error}")))?;
     match meta.version {
         None | Some(1 | 2) => Ok(meta),
         Some(version) => Err(Malformed(format!(
@@ -139,7 +139,7 @@ pub(crate) fn is_meta(text: &[u8]) -> bool {
     serde_json::from_slice::<Meta>(text).is_ok()
 }
 
-fn names(meta: &Meta) -> impl Iterator<Item = &String> {
+fn file_names(meta: &Meta) -> impl Iterator<Item = &String> {
     let attributes = [&meta.means, &meta.scales, &meta.quats, &meta.sh0].into_iter();
     let files = attributes.map(|attribute| &attribute.files);
     files
@@ -147,11 +147,11 @@ fn names(meta: &Meta) -> impl Iterator<Item = &String> {
         .flatten()
 }
 
-type Get<'a> = &'a dyn Fn(&str) -> Result<Cow<'a, [u8]>, Malformed>;
+type ReadFile<'a> = &'a dyn Fn(&str) -> Result<Cow<'a, [u8]>, Malformed>;
 
 /// The scene whose files `get` provides.
-fn parse(get: Get) -> Result<GaussianCloud, Malformed> {
-    let meta = parse_meta(&get(META)?)?;
+fn parse(get: ReadFile) -> Result<GaussianCloud, Malformed> {
+    let meta = parse_meta(&get(META_FILE)?)?;
     let names = [
         ("means", &meta.means.files, 2),
         ("scales", &meta.scales.files, 1),
@@ -162,7 +162,7 @@ fn parse(get: Get) -> Result<GaussianCloud, Malformed> {
     let mut fetch = |attribute: &str, names: &[String], count: usize| {
         if names.len() < count {
             return Err(Malformed(format!(
-                "{META} names {} images for {attribute}; expected {count}",
+                "{META_FILE} names {} images for {attribute}; expected {count}",
                 names.len()
             )));
         }
@@ -179,7 +179,7 @@ fn parse(get: Get) -> Result<GaussianCloud, Malformed> {
     }
     let bytes = files.iter().map(|(_, content)| content.len()).sum();
     let declared = meta.count.or(meta.means.shape.first().copied());
-    let declared = declared.ok_or_else(|| Malformed(format!("{META} does not say how many splats there are")))?;
+    let declared = declared.ok_or_else(|| Malformed(format!("{META_FILE} does not say how many splats there are")))?;
     let count = plausible_count(declared, bytes)?;
 
     // Image 5, if there is one, is the palette; all others have a pixel per splat.
@@ -187,11 +187,12 @@ fn parse(get: Get) -> Result<GaussianCloud, Malformed> {
         .par_iter()
         .enumerate()
         .map(|(i, (name, content))| {
-            let (least, most) = match i {
+            let (min_pixels, max_pixels) = match i {
                 5 => (0, 15 * MAX_PALETTE + SPARE_PIXELS),
                 _ => (count, 4 * count + SPARE_PIXELS),
             };
-            Pixels::decode(content, least, most).map_err(|error| Malformed(format!("{}: {error}", zip::shown(name))))
+            Pixels::decode(content, min_pixels, max_pixels)
+                .map_err(|error| Malformed(format!("{}: {error}", zip::printable(name))))
         })
         .collect::<Result<_, _>>()?;
     decode(&meta, count, &images)
@@ -206,21 +207,21 @@ struct Pixels {
 }
 
 impl Pixels {
-    /// Decodes an image whose header declares between `least` and `most` pixels.
-    fn decode(bytes: &[u8], least: usize, most: usize) -> Result<Self, Malformed> {
-        let damaged = |error: image_webp::DecodingError| Malformed(format!("not a usable WebP image ({error})"));
-        let mut decoder = WebPDecoder::new(Cursor::new(bytes)).map_err(damaged)?;
+    /// Decodes an image whose header declares between `min_pixels` and `max_pixels` pixels.
+    fn decode(bytes: &[u8], min_pixels: usize, max_pixels: usize) -> Result<Self, Malformed> {
+        let webp_error = |error: image_webp::DecodingError| Malformed(format!("not a usable WebP image ({error})"));
+        let mut decoder = WebPDecoder::new(Cursor::new(bytes)).map_err(webp_error)?;
         let (width, height) = decoder.dimensions();
         let (width, height) = (width as usize, height as usize);
         let count = width.saturating_mul(height);
-        if !(least..=most).contains(&count) {
+        if !(min_pixels..=max_pixels).contains(&count) {
             return Err(Malformed(format!(
                 "has {width}x{height} pixels, which does not match the number of splats"
             )));
         }
         let channels = if decoder.has_alpha() { 4 } else { 3 };
         let mut data = vec![0; count * channels];
-        decoder.read_image(&mut data).map_err(damaged)?;
+        decoder.read_image(&mut data).map_err(webp_error)?;
         Ok(Self {
             width,
             height,
@@ -253,7 +254,7 @@ impl Table {
     fn codebook(codebook: &[f32], attribute: &str) -> Result<Self, Malformed> {
         if codebook.is_empty() || codebook.len() > 256 {
             return Err(Malformed(format!(
-                "{META} has a codebook of {} values for {attribute}; expected 1 to 256",
+                "{META_FILE} has a codebook of {} values for {attribute}; expected 1 to 256",
                 codebook.len()
             )));
         }
@@ -274,25 +275,28 @@ impl Table {
 }
 
 /// Decodes the coordinates of an axis from their 16 bits.
-struct Positions {
+struct PositionDecoder {
     bounds: (f32, f32),
     /// All 65,536 values if there are more splats than that, else empty: a table takes an eighth of the exponential's time.
     table: Vec<f32>,
 }
 
-impl Positions {
+impl PositionDecoder {
     fn new(bounds: (f32, f32), count: usize) -> Self {
         let mut positions = Self {
             bounds,
             table: Vec::new(),
         };
         if count > 1 << 16 {
-            positions.table = (0..=u16::MAX).into_par_iter().map(|step| positions.at(step)).collect();
+            positions.table = (0..=u16::MAX)
+                .into_par_iter()
+                .map(|step| positions.decode(step))
+                .collect();
         }
         positions
     }
 
-    fn at(&self, step: u16) -> f32 {
+    fn decode(&self, step: u16) -> f32 {
         if let Some(value) = self.table.get(usize::from(step)) {
             return *value;
         }
@@ -303,8 +307,8 @@ impl Positions {
 }
 
 /// A table for each channel of an attribute.
-fn tables<const N: usize>(attribute: &Attribute, name: &str, is_second: bool) -> Result<[Table; N], Malformed> {
-    if is_second {
+fn tables<const N: usize>(attribute: &Attribute, name: &str, is_version_2: bool) -> Result<[Table; N], Malformed> {
+    if is_version_2 {
         return Ok([Table::codebook(&attribute.codebook, name)?; N]);
     }
     Ok(bounds(&attribute.mins, &attribute.maxs, name)?.map(|(low, high)| Table::bounds(low, high)))
@@ -314,7 +318,7 @@ fn tables<const N: usize>(attribute: &Attribute, name: &str, is_second: bool) ->
 fn bounds<const N: usize>(mins: &[f32], maxs: &[f32], attribute: &str) -> Result<[(f32, f32); N], Malformed> {
     match (mins.first_chunk::<N>(), maxs.first_chunk::<N>()) {
         (Some(mins), Some(maxs)) => Ok(std::array::from_fn(|c| (mins[c], maxs[c]))),
-        _ => Err(Malformed(format!("{META} lacks the {N} bounds of {attribute}"))),
+        _ => Err(Malformed(format!("{META_FILE} lacks the {N} bounds of {attribute}"))),
     }
 }
 
@@ -323,26 +327,26 @@ fn decode(meta: &Meta, count: usize, images: &[Pixels]) -> Result<GaussianCloud,
         unreachable!("five images are fetched");
     };
     let mean_bounds: [(f32, f32); 3] = bounds(&meta.means.mins, &meta.means.maxs, "means")?;
-    let is_second = meta.version == Some(2);
-    let scale_tables: [Table; 3] = tables(&meta.scales, "scales", is_second)?;
-    let mut color_tables: [Table; 4] = tables(&meta.sh0, "sh0", is_second)?;
-    if is_second {
+    let is_version_2 = meta.version == Some(2);
+    let scale_tables: [Table; 3] = tables(&meta.scales, "scales", is_version_2)?;
+    let mut color_tables: [Table; 4] = tables(&meta.sh0, "sh0", is_version_2)?;
+    if is_version_2 {
         color_tables[3] = Table(logits_of_bytes());
     }
 
     let palette = match (&meta.harmonics, images) {
         (Some(harmonics), [.., palette, labels]) if images.len() == 7 => {
-            Palette::decode(harmonics, is_second, palette, labels, count)?
+            Palette::decode(harmonics, is_version_2, palette, labels, count)?
         }
         _ => None,
     };
     let degree = palette.as_ref().map_or(0, |palette| palette.degree);
-    let positions = mean_bounds.map(|bounds| Positions::new(bounds, count));
+    let positions = mean_bounds.map(|bounds| PositionDecoder::new(bounds, count));
     let mut cloud = decode_splats(count, degree, |i, splat| {
         let (low, high) = (low_bytes.rgb(i), high_bytes.rgb(i));
         let (scale, color) = (scales.rgb(i), colors.rgb(i));
         for c in 0..3 {
-            splat.mean[c] = positions[c].at(u16::from_le_bytes([low[c], high[c]]));
+            splat.mean[c] = positions[c].decode(u16::from_le_bytes([low[c], high[c]]));
             splat.log_scale[c] = scale_tables[c].0[usize::from(scale[c])];
             splat.sh[c] = color_tables[c].0[usize::from(color[c])];
         }
@@ -358,10 +362,10 @@ fn decode(meta: &Meta, count: usize, images: &[Pixels]) -> Result<GaussianCloud,
     });
     cloud.antialiased = meta.antialias;
     // Only a codebook of fewer than 256 values has invalid indices.
-    let is_short = [&scale_tables[0], &color_tables[0]].into_iter().any(Table::has_gaps)
+    let has_gaps = [&scale_tables[0], &color_tables[0]].into_iter().any(Table::has_gaps)
         || palette.as_ref().is_some_and(|palette| palette.has_gaps);
     let in_range = |value: &f32| !value.is_nan();
-    if is_short && !(cloud.log_scales.as_flattened().iter().all(in_range) && cloud.sh.iter().all(in_range)) {
+    if has_gaps && !(cloud.log_scales.as_flattened().iter().all(in_range) && cloud.sh.iter().all(in_range)) {
         return Err(Malformed(
             "an index of its images is beyond the end of the codebook; the file is damaged".into(),
         ));
@@ -382,38 +386,38 @@ struct Palette<'a> {
 impl<'a> Palette<'a> {
     fn decode(
         harmonics: &Harmonics,
-        is_second: bool,
+        is_version_2: bool,
         image: &Pixels,
         labels: &'a Pixels,
         count: usize,
     ) -> Result<Option<Self>, Malformed> {
-        let degree = match is_second {
+        let degree = match is_version_2 {
             true => harmonics.bands,
             // Version 1 gives it by the width of the image.
             false => (1..=3)
-                .find(|degree| ROW * (sh::coefficients(*degree) - 1) == image.width)
+                .find(|degree| ENTRIES_PER_ROW * (sh::coefficients(*degree) - 1) == image.width)
                 .unwrap_or(9),
         };
         if degree == 0 {
             return Ok(None);
         }
         let coefficients = sh::coefficients(degree.min(3)) - 1;
-        if degree > 3 || image.width != ROW * coefficients {
+        if degree > 3 || image.width != ENTRIES_PER_ROW * coefficients {
             return Err(Malformed(format!(
                 "its palette is {} pixels wide, which does not fit harmonics of degree {degree}",
                 image.width
             )));
         }
-        let table = match (is_second, harmonics.mins, harmonics.maxs) {
+        let table = match (is_version_2, harmonics.mins, harmonics.maxs) {
             (true, ..) => Table::codebook(&harmonics.codebook, "shN")?,
             (false, Some(low), Some(high)) => Table::bounds(low, high),
-            _ => return Err(Malformed(format!("{META} lacks the bounds of shN"))),
+            _ => return Err(Malformed(format!("{META_FILE} lacks the bounds of shN"))),
         };
-        let entries = ROW * image.height;
-        let highest = (0..count).into_par_iter().map(|i| label(labels, i)).max().unwrap_or(0);
-        if count > 0 && highest >= entries {
+        let entries = ENTRIES_PER_ROW * image.height;
+        let max_label = (0..count).into_par_iter().map(|i| label(labels, i)).max().unwrap_or(0);
+        if count > 0 && max_label >= entries {
             return Err(Malformed(format!(
-                "a label of its harmonics is {highest}, and the palette has {entries} entries; the file is damaged"
+                "a label of its harmonics is {max_label}, and the palette has {entries} entries; the file is damaged"
             )));
         }
         // The image holds the entries one after another, a pixel per coefficient.

@@ -1,5 +1,5 @@
 use super::palette::{Codebook, Palette};
-use super::{LARGEST_W, META, ROW};
+use super::{ENTRIES_PER_ROW, LARGEST_W, META_FILE};
 use crate::splats::quantize::{opacity_byte, smallest_three};
 use crate::splats::rows::{bounds, encode_rows, morton_order};
 use crate::splats::{SogDetail, WriteOptions};
@@ -20,7 +20,7 @@ type Image = (&'static str, usize, usize, usize, Vec<u8>);
 pub(crate) fn write(out: &mut dyn Write, cloud: &GaussianCloud, options: &WriteOptions) -> io::Result<()> {
     let mut archive = Writer::new(out);
     for (name, content) in encode(cloud, options)? {
-        archive.file(name, &content)?;
+        archive.add_file(name, &content)?;
     }
     archive.finish()
 }
@@ -38,35 +38,35 @@ pub(crate) fn encode(cloud: &GaussianCloud, options: &WriteOptions) -> io::Resul
     let order = morton_order(&cloud.means);
     // Sides are multiples of four, as other writers make them.
     let columns = ((count as f64).sqrt() / 4.0).ceil().max(1.0) as usize * 4;
-    let lines = (count as f64 / columns as f64 / 4.0).ceil().max(1.0) as usize * 4;
+    let image_rows = (count as f64 / columns as f64 / 4.0).ceil().max(1.0) as usize * 4;
     let image = |name, channels: usize, encode: &(dyn Fn(usize, &mut [u8]) + Sync)| -> Image {
         let mut pixels = encode_rows(count, channels, |at, pixel| encode(order[at] as usize, pixel));
-        pixels.resize(columns * lines * channels, 0);
-        (name, columns, lines, channels, pixels)
+        pixels.resize(columns * image_rows * channels, 0);
+        (name, columns, image_rows, channels, pixels)
     };
 
     let logarithm = |v: f32| v.abs().ln_1p().copysign(v);
     let (low, high) = bounds(&cloud.means);
     let (low, high) = (low.map(logarithm), high.map(logarithm));
-    let steps = |i: usize, c: usize| {
+    let position_bytes = |i: usize, c: usize| {
         let extent = f64::from(high[c]) - f64::from(low[c]);
         let t = (f64::from(logarithm(cloud.means[i][c])) - f64::from(low[c])) / extent.max(f64::MIN_POSITIVE);
-        (rounded(t * 65535.0, 16 - position_bits, 65535) as u16).to_le_bytes()
+        (round_to_multiple(t * 65535.0, 16 - position_bits, 65535) as u16).to_le_bytes()
     };
-    let scales = Codebook::of(cloud.log_scales.as_flattened(), detail.numbers.clamp(2, 256));
+    let scales = Codebook::of(cloud.log_scales.as_flattened(), detail.codebook.clamp(2, 256));
     let colors: Vec<f32> = cloud
         .sh
         .chunks_exact(width)
         .flat_map(|sh| [sh[0], sh[1], sh[2]])
         .collect();
-    let colors = Codebook::of(&colors, detail.numbers.clamp(2, 256));
+    let colors = Codebook::of(&colors, detail.codebook.clamp(2, 256));
     let dc = |i: usize, c: usize| cloud.sh[i * width + c];
     let mut images = vec![
         image("means_l.webp", 3, &|i, pixel| {
-            (0..3).for_each(|c| pixel[c] = steps(i, c)[0])
+            (0..3).for_each(|c| pixel[c] = position_bytes(i, c)[0])
         }),
         image("means_u.webp", 3, &|i, pixel| {
-            (0..3).for_each(|c| pixel[c] = steps(i, c)[1])
+            (0..3).for_each(|c| pixel[c] = position_bytes(i, c)[1])
         }),
         image("scales.webp", 3, &|i, pixel| {
             (0..3).for_each(|c| pixel[c] = scales.index(cloud.log_scales[i][c]))
@@ -74,7 +74,7 @@ pub(crate) fn encode(cloud: &GaussianCloud, options: &WriteOptions) -> io::Resul
         image("quats.webp", 4, &|i, pixel| {
             let (largest, others) = smallest_three(cloud.quats[i]);
             let others = others.map(|v| {
-                rounded(
+                round_to_multiple(
                     f64::from(v * std::f32::consts::FRAC_1_SQRT_2 + 0.5) * 255.0,
                     8 - rotation_bits,
                     255,
@@ -93,10 +93,10 @@ pub(crate) fn encode(cloud: &GaussianCloud, options: &WriteOptions) -> io::Resul
         "asset": { "generator": "Irradia" },
         "antialias": cloud.antialiased,
         "count": count,
-        "means": { "mins": low.map(shortest), "maxs": high.map(shortest), "files": ["means_l.webp", "means_u.webp"] },
-        "scales": { "codebook": scales.0.map(shortest)[..], "files": ["scales.webp"] },
+        "means": { "mins": low.map(with_f32_digits), "maxs": high.map(with_f32_digits), "files": ["means_l.webp", "means_u.webp"] },
+        "scales": { "codebook": scales.0.map(with_f32_digits)[..], "files": ["scales.webp"] },
         "quats": { "files": ["quats.webp"] },
-        "sh0": { "codebook": colors.0.map(shortest)[..], "files": ["sh0.webp"] },
+        "sh0": { "codebook": colors.0.map(with_f32_digits)[..], "files": ["sh0.webp"] },
     });
 
     // The format stops at degree 3.
@@ -120,9 +120,9 @@ pub(crate) fn encode(cloud: &GaussianCloud, options: &WriteOptions) -> io::Resul
         };
         let entries = palette.entries.len() / rest;
         let mut pixels: Vec<u8> = palette.entries.iter().map(|v| codebook.index(*v)).collect();
-        let rows = entries.div_ceil(ROW);
-        pixels.resize(rows * ROW * rest, 0);
-        images.push(("shN_centroids.webp", ROW * rest / 3, rows, 3, pixels));
+        let rows = entries.div_ceil(ENTRIES_PER_ROW);
+        pixels.resize(rows * ENTRIES_PER_ROW * rest, 0);
+        images.push(("shN_centroids.webp", ENTRIES_PER_ROW * rest / 3, rows, 3, pixels));
         let mut labels: Vec<u8> = palette
             .labels
             .iter()
@@ -131,12 +131,12 @@ pub(crate) fn encode(cloud: &GaussianCloud, options: &WriteOptions) -> io::Resul
                 [low, high, 0]
             })
             .collect();
-        labels.resize(columns * lines * 3, 0);
-        images.push(("shN_labels.webp", columns, lines, 3, labels));
+        labels.resize(columns * image_rows * 3, 0);
+        images.push(("shN_labels.webp", columns, image_rows, 3, labels));
         meta["shN"] = json!({
             "count": entries,
             "bands": degree,
-            "codebook": codebook.0.map(shortest)[..],
+            "codebook": codebook.0.map(with_f32_digits)[..],
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         });
     }
@@ -145,20 +145,20 @@ pub(crate) fn encode(cloud: &GaussianCloud, options: &WriteOptions) -> io::Resul
         .map(|(name, width, height, channels, pixels)| Ok((name, webp(&pixels, width, height, channels)?)))
         .collect::<io::Result<_>>()?;
     // Last, so that a folder with it is complete.
-    files.push((META, serde_json::to_vec(&meta).map_err(io::Error::other)?));
+    files.push((META_FILE, serde_json::to_vec(&meta).map_err(io::Error::other)?));
     Ok(files)
 }
 
 /// An `f64` with the digits of an `f32`: otherwise half of the text would be digits beyond its precision.
-fn shortest(value: f32) -> f64 {
+fn with_f32_digits(value: f32) -> f64 {
     value.to_string().parse().unwrap_or(f64::from(value))
 }
 
-/// `value` rounded to a multiple of `2^bits`, at most `most`: the lowest bits are zero, and take no bytes.
-fn rounded(value: f64, bits: u32, most: u32) -> u32 {
+/// `value` rounded to a multiple of `2^bits`, at most `max`: the lowest bits are zero, and take no bytes.
+fn round_to_multiple(value: f64, bits: u32, max: u32) -> u32 {
     let step = f64::from(1u32 << bits);
     let value = ((value / step).round() * step).max(0.0) as u32;
-    value.min(most >> bits << bits)
+    value.min(max >> bits << bits)
 }
 
 /// An image in lossless WebP, the smaller of two encodings: differences from neighbours suit smooth images, plain values suit indices.
@@ -168,11 +168,11 @@ fn webp(pixels: &[u8], width: usize, height: usize, channels: usize) -> io::Resu
     } else {
         ColorType::Rgb8
     };
-    let encode = |predicts: bool| {
+    let encode = |use_predictor: bool| {
         let mut bytes = Vec::new();
         let mut encoder = WebPEncoder::new(&mut bytes);
         let mut params = EncoderParams::default();
-        params.use_predictor_transform = predicts;
+        params.use_predictor_transform = use_predictor;
         encoder.set_params(params);
         match encoder.encode(pixels, width as u32, height as u32, color) {
             Ok(()) => Ok(bytes),

@@ -13,9 +13,9 @@ pub(crate) use write::{encode, write};
 
 const MAGIC: &[u8; 4] = b"NGSP";
 /// Bit of the flags for scenes trained with the Mip-Splatting filters.
-const ANTIALIASED: u8 = 1;
+const ANTIALIASED_FLAG: u8 = 1;
 /// Bit of the flags for extensions, which lie between header and table (version 4) or at the end.
-const EXTENSIONS: u8 = 2;
+const EXTENSIONS_FLAG: u8 = 2;
 /// A step of colour is `1 / (255 COLOR_SCALE)` of a DC coefficient.
 const COLOR_SCALE: f32 = 0.15;
 /// ln scales are stored as `(ln scale + 10) 16`.

@@ -1,6 +1,6 @@
 use super::*;
 use crate::Malformed;
-use crate::bytes::Bytes;
+use crate::bytes::ByteReader;
 use crate::splats::axes::Signs;
 use crate::splats::quantize::{from_smallest_three, logits_of_bytes};
 use crate::splats::rows::{decode_splats, plausible_count};
@@ -10,7 +10,7 @@ use irradia_scene::half::from_half;
 use rayon::prelude::*;
 
 /// The extension that declares the axes of the file: a number for right, up, back and their alternatives.
-const ADOBE_AXES: u32 = 0xadbe_0003;
+const ADOBE_AXES_EXTENSION: u32 = 0xadbe_0003;
 
 /// Parses an SPZ file of version 1 to 4, compressed or as the bare stream of the versions up to 3.
 ///
@@ -24,7 +24,11 @@ pub fn parse(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
         let widths = header.widths();
         let arrays = stream.take(count * widths.iter().sum::<usize>())?;
         stream.finish()?;
-        return Ok(decode(&header, split(&arrays, count, widths), Signs::HALF_TURN_X));
+        return Ok(decode(
+            &header,
+            split_arrays(&arrays, count, widths),
+            Signs::HALF_TURN_X,
+        ));
     }
     let Some([a, b, c, d]) = bytes.strip_prefix(MAGIC).and_then(|rest| rest.first_chunk::<4>()) else {
         return Err(Malformed(
@@ -34,16 +38,16 @@ pub fn parse(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     if u32::from_le_bytes([*a, *b, *c, *d]) >= 4 {
         return parse_streams(bytes);
     }
-    let mut rest = Bytes::new(bytes);
+    let mut rest = ByteReader::new(bytes);
     let header = legacy_header(rest.take(16)?)?;
     let count = plausible_count(header.count.into(), bytes.len())?;
     let widths = header.widths();
     let arrays = rest.take(count * widths.iter().sum::<usize>())?;
-    Ok(decode(&header, split(arrays, count, widths), Signs::HALF_TURN_X))
+    Ok(decode(&header, split_arrays(arrays, count, widths), Signs::HALF_TURN_X))
 }
 
 /// The fields that every version has, in this order.
-fn header_fields(rest: &mut Bytes) -> Result<Header, Malformed> {
+fn header_fields(rest: &mut ByteReader) -> Result<Header, Malformed> {
     Ok(Header {
         version: rest.u32()?,
         count: rest.u32()?,
@@ -54,20 +58,20 @@ fn header_fields(rest: &mut Bytes) -> Result<Header, Malformed> {
 }
 
 fn legacy_header(bytes: &[u8]) -> Result<Header, Malformed> {
-    let mut rest = Bytes::new(bytes);
+    let mut rest = ByteReader::new(bytes);
     if rest.take(4)? != MAGIC {
         return Err(Malformed("not an SPZ file: its stream does not begin with NGSP".into()));
     }
     let header = header_fields(&mut rest)?;
     match header.version {
-        1..=3 => checked(header),
+        1..=3 => validated(header),
         version => Err(Malformed(format!(
             "SPZ version {version} is not known in a gzip stream; expected 1 to 3"
         ))),
     }
 }
 
-fn checked(header: Header) -> Result<Header, Malformed> {
+fn validated(header: Header) -> Result<Header, Malformed> {
     if header.degree > 4 {
         return Err(Malformed(format!(
             "declares spherical harmonics of degree {}; expected 0 to 4",
@@ -85,22 +89,22 @@ fn checked(header: Header) -> Result<Header, Malformed> {
 
 /// Version 4.
 fn parse_streams(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
-    let mut rest = Bytes::new(&bytes[4..]);
+    let mut rest = ByteReader::new(&bytes[4..]);
     let header = header_fields(&mut rest)?;
-    let (streams, table) = (usize::from(rest.u8()?), rest.u32()? as usize);
+    let (streams, table_offset) = (usize::from(rest.u8()?), rest.u32()? as usize);
     if header.version != 4 {
         return Err(Malformed(format!(
             "SPZ version {} is not known; expected 1 to 4",
             header.version
         )));
     }
-    let header = checked(header)?;
+    let header = validated(header)?;
     let count = plausible_count(header.count.into(), bytes.len())?;
-    let body = bytes.get(table..).filter(|_| table >= 32);
+    let body = bytes.get(table_offset..).filter(|_| table_offset >= 32);
     let body = body.ok_or_else(|| Malformed("its table of streams is outside of the file".into()))?;
-    let signs = match header.flags & EXTENSIONS {
+    let signs = match header.flags & EXTENSIONS_FLAG {
         0 => Signs::HALF_TURN_X,
-        _ => signs_of_extensions(&bytes[32..table])?,
+        _ => signs_of_extensions(&bytes[32..table_offset])?,
     };
 
     // Arrays without content have no stream.
@@ -116,7 +120,7 @@ fn parse_streams(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
             expected.len()
         )));
     }
-    let mut body = Bytes::new(body);
+    let mut body = ByteReader::new(body);
     let mut sizes = Vec::with_capacity(streams);
     for (i, expected) in expected.iter().enumerate() {
         let [packed, size] = [body.u64()?, body.u64()?];
@@ -146,12 +150,12 @@ fn parse_streams(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
 
 /// The axes that an extension declares, if one does; other extensions do not affect the splats.
 fn signs_of_extensions(records: &[u8]) -> Result<Signs, Malformed> {
-    let mut rest = Bytes::new(records);
+    let mut rest = ByteReader::new(records);
     while !rest.is_empty() {
         let [kind, length] = [rest.u32()?, rest.u32()?];
         let payload = rest.take(length as usize)?;
-        if kind == ADOBE_AXES {
-            let axes = Bytes::new(payload).u32()?;
+        if kind == ADOBE_AXES_EXTENSION {
+            let axes = ByteReader::new(payload).u32()?;
             let sign = |bit: u32| {
                 if (axes.wrapping_sub(1) >> bit) & 1 == 0 {
                     -1.0
@@ -172,7 +176,7 @@ fn signs_of_extensions(records: &[u8]) -> Result<Signs, Malformed> {
     Ok(Signs::HALF_TURN_X)
 }
 
-fn split(bytes: &[u8], count: usize, widths: [usize; 6]) -> [&[u8]; 6] {
+fn split_arrays(bytes: &[u8], count: usize, widths: [usize; 6]) -> [&[u8]; 6] {
     let mut rest = bytes;
     widths.map(|width| {
         let (array, left) = rest.split_at(width * count);
@@ -188,11 +192,11 @@ fn decode(header: &Header, arrays: [&[u8]; 6], signs: Signs) -> GaussianCloud {
     let logits = logits_of_bytes();
     let unit = (-f32::from(header.fraction_bits)).exp2();
     let mut cloud = decode_splats(opacities.len(), header.degree.into(), |i, splat| {
-        let of = |array: &[u8], which: usize| -> std::ops::Range<usize> {
-            debug_assert!(array.len() >= (i + 1) * widths[which]);
-            i * widths[which]..(i + 1) * widths[which]
+        let row_range = |array: &[u8], array_index: usize| -> std::ops::Range<usize> {
+            debug_assert!(array.len() >= (i + 1) * widths[array_index]);
+            i * widths[array_index]..(i + 1) * widths[array_index]
         };
-        let position = &positions[of(positions, 0)];
+        let position = &positions[row_range(positions, 0)];
         for c in 0..3 {
             splat.mean[c] = match header.version {
                 1 => from_half(u16::from_le_bytes([position[2 * c], position[2 * c + 1]])),
@@ -206,7 +210,7 @@ fn decode(header: &Header, arrays: [&[u8]; 6], signs: Signs) -> GaussianCloud {
             splat.log_scale[c] = f32::from(scales[3 * i + c]) / SCALE_STEPS - SCALE_OFFSET;
         }
         *splat.opacity_logit = logits[usize::from(opacities[i])];
-        *splat.quat = match rotations[of(rotations, 4)] {
+        *splat.quat = match rotations[row_range(rotations, 4)] {
             [a, b, c, d] => rotation(u32::from_le_bytes([a, b, c, d])),
             [x, y, z] => {
                 let [x, y, z] = [x, y, z].map(|v| f32::from(v) / 127.5 - 1.0);
@@ -214,11 +218,11 @@ fn decode(header: &Header, arrays: [&[u8]; 6], signs: Signs) -> GaussianCloud {
             }
             _ => unreachable!("three or four bytes"),
         };
-        for (to, byte) in splat.sh[3..].iter_mut().zip(&harmonics[of(harmonics, 5)]) {
+        for (to, byte) in splat.sh[3..].iter_mut().zip(&harmonics[row_range(harmonics, 5)]) {
             *to = (f32::from(*byte) - 128.0) / 128.0;
         }
     });
-    cloud.antialiased = header.flags & ANTIALIASED != 0;
+    cloud.antialiased = header.flags & ANTIALIASED_FLAG != 0;
     signs.apply(&mut cloud);
     cloud
 }
@@ -242,7 +246,7 @@ mod tests {
     fn axes_of_the_adobe_extension() {
         let record = |axes: u32| {
             let other = [0x1234_0001u32, 3].map(u32::to_le_bytes).concat();
-            let ours = [ADOBE_AXES, 4, axes].map(u32::to_le_bytes).concat();
+            let ours = [ADOBE_AXES_EXTENSION, 4, axes].map(u32::to_le_bytes).concat();
             [&other[..], &[1, 2, 3], &ours[..]].concat()
         };
         // Right down front is ours, right up back the format's own, left up front glTF's.

@@ -1,7 +1,7 @@
 use super::*;
 use crate::gzip;
 use crate::splats::axes::Signs;
-use crate::splats::quantize::{byte, normalized, opacity_byte, smallest_three};
+use crate::splats::quantize::{normalized, opacity_byte, round_to_byte, smallest_three};
 use crate::splats::rows::{encode_rows, morton_order};
 use crate::splats::{Quality, SpzVersion};
 use irradia_scene::{GaussianCloud, sh};
@@ -10,7 +10,7 @@ use ruzstd::encoding::{CompressionLevel, compress_to_vec};
 use std::io::{self, Write};
 
 /// Fractional bits of positions: those of the format's own writer, and the maximum.
-const OWN_FRACTION_BITS: i32 = 12;
+const DEFAULT_FRACTION_BITS: i32 = 12;
 const MAX_FRACTION_BITS: i32 = 20;
 
 /// Writes `cloud`; the quality selects the bits of positions and of coefficients above DC.
@@ -35,7 +35,7 @@ pub(crate) fn encode(cloud: &GaussianCloud, quality: Quality, version: SpzVersio
         // Readers of version 2 support no higher degree.
         degree: cloud.sh_degree.min(if version == SpzVersion::V2 { 3 } else { 4 }) as u8,
         fraction_bits: fraction_bits(&cloud.means, quality),
-        flags: if cloud.antialiased { ANTIALIASED } else { 0 },
+        flags: if cloud.antialiased { ANTIALIASED_FLAG } else { 0 },
     };
     let arrays = arrays(cloud, &header, quality);
     let mut bytes = MAGIC.to_vec();
@@ -68,14 +68,14 @@ pub(crate) fn encode(cloud: &GaussianCloud, quality: Quality, version: SpzVersio
 /// total, and up to 20 at high quality. Finer steps are noise, which does not compress. Never more than 23 bits in total, so that the
 /// farthest coordinate fits.
 fn fraction_bits(means: &[[f32; 3]], quality: Quality) -> u8 {
-    let farthest = means.as_flattened().iter().fold(0f32, |most, v| most.max(v.abs()));
-    let before = farthest.max(f32::MIN_POSITIVE).log2().floor() as i32 + 1;
+    let max_coordinate = means.as_flattened().iter().fold(0f32, |max, v| max.max(v.abs()));
+    let integer_bits = max_coordinate.max(f32::MIN_POSITIVE).log2().floor() as i32 + 1;
     let wanted = match quality {
-        Quality::Low => OWN_FRACTION_BITS,
-        Quality::Normal => (16 - before).max(OWN_FRACTION_BITS),
+        Quality::Low => DEFAULT_FRACTION_BITS,
+        Quality::Normal => (16 - integer_bits).max(DEFAULT_FRACTION_BITS),
         Quality::High => MAX_FRACTION_BITS,
     };
-    wanted.min(23 - before).clamp(0, MAX_FRACTION_BITS) as u8
+    wanted.min(23 - integer_bits).clamp(0, MAX_FRACTION_BITS) as u8
 }
 
 /// The six arrays, along a Morton curve, which compresses better.
@@ -84,7 +84,7 @@ fn arrays(cloud: &GaussianCloud, header: &Header, quality: Quality) -> [Vec<u8>;
     let (count, width) = (cloud.len(), 3 * cloud.sh_coefficients());
     let order = morton_order(&cloud.means);
     let steps = f32::from(header.fraction_bits).exp2();
-    let (bits_of_first, bits_of_rest) = match quality {
+    let (first_band_bits, higher_band_bits) = match quality {
         Quality::Low => (4, 3),
         // The format's own.
         Quality::Normal => (5, 4),
@@ -92,8 +92,8 @@ fn arrays(cloud: &GaussianCloud, header: &Header, quality: Quality) -> [Vec<u8>;
     };
     let signs = Signs::HALF_TURN_X;
     let (bands, first_band) = (signs.bands(), 3 * (sh::coefficients(1) - 1));
-    let array = |which: usize, encode: &(dyn Fn(usize, &mut [u8]) + Sync)| {
-        encode_rows(count, widths[which], |at, row| encode(order[at] as usize, row))
+    let array = |array_index: usize, encode: &(dyn Fn(usize, &mut [u8]) + Sync)| {
+        encode_rows(count, widths[array_index], |at, row| encode(order[at] as usize, row))
     };
     [
         array(0, &|i, row| {
@@ -105,25 +105,29 @@ fn arrays(cloud: &GaussianCloud, header: &Header, quality: Quality) -> [Vec<u8>;
         array(1, &|i, row| row[0] = opacity_byte(cloud.opacity_logits[i])),
         array(2, &|i, row| {
             for (to, dc) in row.iter_mut().zip(&cloud.sh[i * width..]) {
-                *to = byte((dc * COLOR_SCALE + 0.5) * 255.0);
+                *to = round_to_byte((dc * COLOR_SCALE + 0.5) * 255.0);
             }
         }),
         array(3, &|i, row| {
             for (to, scale) in row.iter_mut().zip(cloud.log_scales[i]) {
-                *to = byte((scale + SCALE_OFFSET) * SCALE_STEPS);
+                *to = round_to_byte((scale + SCALE_OFFSET) * SCALE_STEPS);
             }
         }),
         array(4, &|i, row| {
             let quat = signs.quat(cloud.quats[i]);
             match row.len() {
-                3 => row.copy_from_slice(&first_three(quat)),
+                3 => row.copy_from_slice(&xyz_bytes(quat)),
                 _ => row.copy_from_slice(&rotation_bits(quat).to_le_bytes()),
             }
         }),
         array(5, &|i, row| {
             let rest = &cloud.sh[i * width + 3..(i + 1) * width];
             for (k, (to, value)) in row.iter_mut().zip(rest).enumerate() {
-                let bits = if k < first_band { bits_of_first } else { bits_of_rest };
+                let bits = if k < first_band {
+                    first_band_bits
+                } else {
+                    higher_band_bits
+                };
                 *to = harmonic_byte(value * bands[k / 3], bits);
             }
         }),
@@ -150,10 +154,10 @@ fn rotation_bits(quat: [f32; 4]) -> u32 {
 }
 
 /// Version 2: x, y, z with a positive w.
-fn first_three(quat: [f32; 4]) -> [u8; 3] {
+fn xyz_bytes(quat: [f32; 4]) -> [u8; 3] {
     let quat = normalized(quat);
-    let factor = if quat[0] < 0.0 { -127.5 } else { 127.5 };
-    [1, 2, 3].map(|c| byte(quat[c] * factor + 127.5))
+    let scale = if quat[0] < 0.0 { -127.5 } else { 127.5 };
+    [1, 2, 3].map(|c| round_to_byte(quat[c] * scale + 127.5))
 }
 
 #[cfg(test)]

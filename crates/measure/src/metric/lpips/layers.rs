@@ -39,7 +39,7 @@ pub(super) struct Convolution<T> {
 }
 
 /// Output pixels per matrix product: their patches stay in the L2 cache.
-const PIXELS_A_BAND: usize = 512;
+const PIXELS_PER_BAND: usize = 512;
 
 impl<T: Real> Convolution<T> {
     /// From a kernel `[output, input, side, side]` and a bias `[output]`.
@@ -73,7 +73,7 @@ impl<T: Real> Convolution<T> {
         let (height, width) = (size(input.height), size(input.width));
         let channels = layers.iter().map(|layer| layer.bias.len()).sum();
         let mut data = vec![T::zero(); height * width * channels];
-        let rows_a_band = (PIXELS_A_BAND / width).max(1);
+        let rows_a_band = (PIXELS_PER_BAND / width).max(1);
         let bands = data.par_chunks_mut(rows_a_band * width * channels);
         bands.enumerate().for_each_init(Vec::new, |patches, (band, out)| {
             let rows = band * rows_a_band..band * rows_a_band + out.len() / (width * channels);
@@ -151,9 +151,9 @@ impl<T: Real> Convolution<T> {
     /// Adds the gradient through channels `first..` of `v_out` to `v_input`; [`relu_vjp`] has been applied to `v_out`.
     pub(super) fn vjp(&self, v_out: &Map<T>, first: usize, v_input: &mut Map<T>) {
         if self.side == 1 {
-            let inputs = v_input.data.par_chunks_mut(PIXELS_A_BAND * self.input);
+            let inputs = v_input.data.par_chunks_mut(PIXELS_PER_BAND * self.input);
             inputs
-                .zip(v_out.data.par_chunks(PIXELS_A_BAND * v_out.channels))
+                .zip(v_out.data.par_chunks(PIXELS_PER_BAND * v_out.channels))
                 .for_each(|(v_input, v_out_part)| {
                     self.multiply_vjp(v_out_part, v_out.channels, first, T::one(), v_input);
                 });
@@ -162,9 +162,9 @@ impl<T: Real> Convolution<T> {
         // The gradients of all patches; each input row then sums those that contain it: rows are disjoint.
         let run = self.side * self.input;
         let mut v_patches = vec![T::zero(); v_out.height * v_out.width * self.side * run];
-        let bands = v_patches.par_chunks_mut(PIXELS_A_BAND * self.side * run);
+        let bands = v_patches.par_chunks_mut(PIXELS_PER_BAND * self.side * run);
         bands
-            .zip(v_out.data.par_chunks(PIXELS_A_BAND * v_out.channels))
+            .zip(v_out.data.par_chunks(PIXELS_PER_BAND * v_out.channels))
             .for_each(|(v_patches, v_out_part)| {
                 self.multiply_vjp(v_out_part, v_out.channels, first, T::zero(), v_patches);
             });
@@ -300,7 +300,7 @@ pub(super) fn max_pool_vjp<T: Real>(input: &Map<T>, out: &Map<T>, v_out: &Map<T>
 mod tests {
     use super::*;
     use irradia_scene::Rng;
-    use irradia_testkit::differences::directional;
+    use irradia_testkit::finite_differences::check_directional;
 
     const CEIL: Pool = Pool { side: 3, ceil: true };
 
@@ -335,7 +335,7 @@ mod tests {
             dot(&v_out, &forward(&Map { data, ..*input }))
         };
         // Piecewise linear: only rounding error, unless a kink lies within a step (none for these seeds).
-        directional(&input.data, &v_input.data, value, 1e-6, 1e-7);
+        check_directional(&input.data, &v_input.data, value, 1e-6, 1e-7);
     }
 
     #[test]

@@ -46,7 +46,7 @@ impl LpipsNet {
     }
 
     /// Name of a tensor that no other backbone has.
-    fn mark(self) -> &'static str {
+    fn unique_tensor(self) -> &'static str {
         match self {
             Self::Squeeze => "features.3.squeeze.weight",
             Self::Alex => "features.3.weight",
@@ -56,7 +56,7 @@ impl LpipsNet {
 
     /// The network whose tensors are present according to `has`.
     pub(super) fn recognise(has: impl Fn(&str) -> bool) -> Option<Self> {
-        Self::ALL.into_iter().find(|net| has(net.mark()))
+        Self::ALL.into_iter().find(|net| has(net.unique_tensor()))
     }
 }
 

@@ -7,7 +7,7 @@ use super::weights::{ImportedTensor, LpipsError, Tensors, heads, to_weights_file
 use super::{Lpips, map_of};
 use crate::metric::lpips::backbone::Backbone;
 use irradia_scene::{Image, Rng};
-use irradia_testkit::differences::directional;
+use irradia_testkit::finite_differences::check_directional;
 use std::cell::RefCell;
 use std::collections::BTreeMap;
 
@@ -192,7 +192,7 @@ fn alex_and_vgg_gradients_match_finite_differences() {
             network.distance(Map { data, ..a }, b.clone())
         };
         // Between kinks the distance is smooth; a step of 1e-7 crosses almost none.
-        directional(&a.data, &v.data, moved, 1e-7, 1e-5);
+        check_directional(&a.data, &v.data, moved, 1e-7, 1e-5);
     }
 }
 

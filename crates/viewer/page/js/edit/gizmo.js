@@ -16,13 +16,13 @@ import { across, add, axes, cross, dot, length, normalize, rotate, scale, subtra
 /** A camera with the intrinsics of its picture. @typedef {{ camera: Camera, k: Intrinsics }} Shown */
 
 /** Length of an axis, CSS pixels. */
-const REACH = 78;
+const AXIS_LENGTH = 78;
 /** Distance of the near and the far corner of a plane's handle from the centre along each axis, as a share of the reach. */
-export const PLANE = [0.24, 0.46];
+export const PLANE_CORNERS = [0.24, 0.46];
 /** Distance at which a handle is grabbed, CSS pixels. */
-const GRAB = 9;
+const GRAB_DISTANCE = 9;
 /** Least sine of the angle between the view and a plane at which one can drag in the plane. */
-const FLAT = 0.12;
+const MIN_PLANE_SINE = 0.12;
 
 /** @type {Quat} */
 export const LEVEL = [1, 0, 0, 0];
@@ -43,7 +43,7 @@ export function unitsAt({ camera, k }, point, pixels) {
 /** The length and the directions of the handles, world.
  * @param {Shown} shown @param {Place} place @param {number} pixel the picture's per CSS pixel */
 export function handles(shown, { center, frame }, pixel) {
-  const reach = unitsAt(shown, center, REACH * pixel);
+  const reach = unitsAt(shown, center, AXIS_LENGTH * pixel);
   return { reach, directions: axes(frame) };
 }
 
@@ -60,7 +60,7 @@ export function ring(center, axis, radius) {
 /** The corners of a plane's handle. @param {Vec3} center @param {Vec3[]} directions @param {number} axis across it @param {number} reach @returns {Vec3[]} */
 export function planeCorners(center, directions, axis, reach) {
   const [u, v] = [directions[(axis + 1) % 3], directions[(axis + 2) % 3]];
-  const [near, far] = PLANE;
+  const [near, far] = PLANE_CORNERS;
   return [[near, near], [far, near], [far, far], [near, far]].map(([a, b]) => add(center, add(scale(u, a * reach), scale(v, b * reach))));
 }
 
@@ -95,7 +95,7 @@ function isInside(corners, x, y) {
 export function handleAt(shown, place, way, x, y, pixel, coarse = false) {
   const { reach, directions } = handles(shown, place, pixel);
   const on = (/** @type {Vec3} */ point) => project(shown.camera, shown.k, point);
-  const within = (coarse ? 2 : 1) * GRAB * pixel;
+  const within = (coarse ? 2 : 1) * GRAB_DISTANCE * pixel;
   const middle = on(place.center);
   if (!middle) return null;
   if (way !== "rotate" && Math.hypot(middle[0] - x, middle[1] - y) < within) return { kind: "free", axis: -1 };
@@ -122,7 +122,7 @@ function ray({ camera, k }, x, y) {
  * @param {Vec3} origin @param {Vec3} direction @param {Vec3} point @param {Vec3} normal */
 function meet(origin, direction, point, normal) {
   const slope = dot(direction, normal);
-  if (Math.abs(slope) < FLAT * length(direction)) return null;
+  if (Math.abs(slope) < MIN_PLANE_SINE * length(direction)) return null;
   const t = dot(subtract(point, origin), normal) / slope;
   return t > 0 ? add(origin, scale(direction, t)) : null;
 }

@@ -12,10 +12,10 @@ import { state } from "../state.js";
 /** @typedef {import("./pointer.js").Pointer} Pointer */
 
 /** Colours of lines: of shapes that add, of shapes that subtract, and of the selection. */
-const ADDS = "#6ea8fe";
-const SUBTRACTS = "#e5736f";
-const SELECTED = "#ffb800";
-const FREE = "#ffffff";
+const ADD_COLOR = "#6ea8fe";
+const SUBTRACT_COLOR = "#e5736f";
+const SELECTION_COLOR = "#ffb800";
+const FREE_COLOR = "#ffffff";
 
 /** @param {Draw} draw @param {number} pixel @param {Pointer} pointer */
 export function drawEditing(draw, pixel, pointer) {
@@ -33,7 +33,7 @@ function drawSelection(draw, pixel, [low, high], pointer) {
   const all = corners({ kind: "box", center: scale(add(low, high), 0.5), half, rotation: [1, 0, 0, 0] });
   const motion = pointer.before ? null : pointer.motion;
   const { context } = draw;
-  context.strokeStyle = SELECTED;
+  context.strokeStyle = SELECTION_COLOR;
   context.globalAlpha = motion ? 0.35 : 0.6;
   context.setLineDash([4 * pixel, 3 * pixel]);
   edges(draw, all);
@@ -51,7 +51,7 @@ function edges(draw, all) {
 function drawRegion(draw, pixel, pointer) {
   const region = state.get("region");
   if (!region || region.kind !== pointer.tools.tool) return;
-  draw.context.strokeStyle = state.get("selectMode") === "subtract" ? SUBTRACTS : ADDS;
+  draw.context.strokeStyle = state.get("selectMode") === "subtract" ? SUBTRACT_COLOR : ADD_COLOR;
   draw.context.lineWidth = 1.5 * pixel;
   if (region.kind === "box") edges(draw, corners(region));
   else for (const axis of axes(region.rotation)) polyline(draw, ring(region.center, axis, region.half[0]));
@@ -119,7 +119,7 @@ function drawGizmo(draw, pixel, pointer) {
   context.lineWidth = pixel;
   context.lineCap = "butt";
   if (gizmo.way === "rotate") return;
-  context.fillStyle = FREE;
+  context.fillStyle = FREE_COLOR;
   context.strokeStyle = "#0009";
   context.beginPath();
   context.arc(middle[0], middle[1], (isHeld("free", -1) ? 6 : 4.5) * pixel, 0, 7);
@@ -148,7 +148,7 @@ function outline(context, points) {
 function drawTool({ context }, pixel, { tools }) {
   const { drawn, at, tool } = tools;
   const subtracts = (drawn?.mode ?? state.get("selectMode")) === "subtract";
-  const color = subtracts ? SUBTRACTS : ADDS;
+  const color = subtracts ? SUBTRACT_COLOR : ADD_COLOR;
   context.strokeStyle = context.fillStyle = color;
   const radius = state.get("brush") * pixel;
   if (tool === "brush" && at) {

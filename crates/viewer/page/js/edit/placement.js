@@ -1,33 +1,14 @@
 // An edit may move the whole scene; the cameras of views and of this page then follow.
 
-import { add, length, multiply, rotate, scale, subtract, unit } from "../math.js";
+import { multiply, rotate, scale, unit } from "../math.js";
 import { path } from "../path.js";
+import { REST, between, isRest, placed, placedCamera } from "../similarity.js";
 import { state } from "../state.js";
 
-/** @typedef {import("../math.js").Vec3} Vec3 */
-/** @typedef {import("../math.js").Quat} Quat */
-/** `x -> scale rotation x + translation`, from the world of the scene as it was opened.
- * @typedef {{ scale: number, rotation: Quat, translation: Vec3 }} Placement */
+/** @typedef {import("../similarity.js").Similarity} Similarity */
 
-/** @type {Placement} */
-const NONE = { scale: 1, rotation: [1, 0, 0, 0], translation: [0, 0, 0] };
-
-/** @param {Placement} by @param {readonly number[]} point @returns {Vec3} */
-const placed = (by, point) => add(scale(rotate(by.rotation, point), by.scale), by.translation);
-
-/** The inverse of `from`, then `to`. @param {Placement} from @param {Placement} to @returns {Placement} */
-function between(from, to) {
-  const [w, x, y, z] = from.rotation;
-  const rotation = unit(multiply(to.rotation, [w, -x, -y, -z]));
-  const factor = to.scale / from.scale;
-  return { scale: factor, rotation, translation: subtract(to.translation, scale(rotate(rotation, from.translation), factor)) };
-}
-
-/** @param {Placement} by */
-const isRest = ({ scale: factor, rotation, translation }) =>
-  Math.abs(factor - 1) < 1e-9 && Math.abs(Math.abs(rotation[0]) - 1) < 1e-12 && length(translation) < 1e-9;
-
-let at = NONE;
+/** From the world of the scene as it was opened. */
+let at = REST;
 /** Whether a scene has been received. */
 let seen = false;
 /** @type {import("../camera.js").View[] | null} */
@@ -38,7 +19,7 @@ state.addEventListener("hello", () => {
   placeViews();
 });
 state.addEventListener("scene", () => {
-  const to = state.get("scene")?.placement ?? NONE;
+  const to = state.get("scene")?.placement ?? REST;
   const by = between(at, to);
   const isFirst = !seen;
   [at, seen] = [to, true];
@@ -50,14 +31,14 @@ state.addEventListener("scene", () => {
 
 function placeViews() {
   if (!original || (isRest(at) && state.get("views") === original)) return;
-  state.set({ views: original.map((view) => ({ ...view, position: placed(at, view.position), rotation: unit(multiply(at.rotation, view.rotation)) })) });
+  state.set({ views: original.map((view) => placedCamera(at, view)) });
 }
 
-/** Moves the camera with the scene, so that the picture stays the same. @param {Placement} by */
+/** Moves the camera with the scene, so that the picture stays the same. @param {Similarity} by */
 function follow(by) {
   const { camera, pivot, up, measured, metres, region, view } = state.values;
   state.set({
-    camera: { ...camera, position: placed(by, camera.position), rotation: unit(multiply(by.rotation, camera.rotation)) },
+    camera: placedCamera(by, camera),
     pivot: placed(by, pivot),
     up: rotate(by.rotation, up),
     measured: measured.map((point) => placed(by, point)),
@@ -66,7 +47,6 @@ function follow(by) {
     clip: null,
     view,
   });
-  const key = (/** @type {import("../path.js").Key} */ k) => ({ ...k, position: placed(by, k.position), rotation: unit(multiply(by.rotation, k.rotation)) });
-  path.keys = path.keys.map(key);
+  path.keys = path.keys.map((key) => placedCamera(by, key));
   path.changed();
 }

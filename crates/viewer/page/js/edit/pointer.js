@@ -14,7 +14,7 @@ import { Tools } from "./tools.js";
 /** @typedef {import("./shapes.js").Point} Point */
 
 /** Milliseconds between two selections while a region is dragged. */
-const LIVE = 150;
+const SELECT_INTERVAL = 150;
 
 export class Pointer extends EventTarget {
   /** @type {Drag | null} */
@@ -146,7 +146,7 @@ export class Pointer extends EventTarget {
     const tool = this.tools.tool;
     if (!chosen || chosen.kind !== tool) return;
     const time = performance.now();
-    if (!now && this.drag && time < this.selectedAt + LIVE) return;
+    if (!now && this.drag && time < this.selectedAt + SELECT_INTERVAL) return;
     this.selectedAt = time;
     session.select([region(chosen)], state.get("selectMode"), session.live("region"));
   }

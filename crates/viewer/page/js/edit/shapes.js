@@ -10,7 +10,7 @@ import { cross, normalize, rotate } from "../math.js";
 /** A region in the scene. @typedef {{ kind: "box" | "sphere", center: Vec3, half: Vec3, rotation: Quat }} Region */
 
 /** Maximum number of points of a line: longer lines are thinned, since each point is compared with every splat. */
-const MOST_POINTS = 400;
+const MAX_POINTS = 400;
 
 /** @param {Camera} camera @param {Intrinsics} k */
 const viewpoint = (camera, k) => ({
@@ -19,7 +19,7 @@ const viewpoint = (camera, k) => ({
 
 /** Thins a line, and rounds it to tenths of a pixel, which is finer than any hand. @param {Point[]} points */
 function thinned(points) {
-  const every = Math.ceil(points.length / MOST_POINTS);
+  const every = Math.ceil(points.length / MAX_POINTS);
   const kept = every > 1 ? points.filter((_, i) => i % every === 0 || i === points.length - 1) : points;
   return kept.map(([x, y]) => [Math.round(10 * x) / 10, Math.round(10 * y) / 10]);
 }

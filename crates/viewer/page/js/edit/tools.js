@@ -28,15 +28,15 @@ const NAMES = TOOLS.map(([name]) => name);
 /** @param {string} tool @returns {tool is Tool} */
 export const isEditTool = (tool) => NAMES.includes(tool);
 /** Tools that draw a line of points. */
-const LINES = ["rectangle", "lasso", "brush", "cut"];
+const LINE_TOOLS = ["rectangle", "lasso", "brush", "cut"];
 /** Of these, the tools with two points only: the ends of a line, or opposite corners. */
-const TWO = ["rectangle", "cut"];
+const TWO_POINT_TOOLS = ["rectangle", "cut"];
 /** Distance between points of a line, CSS pixels. */
-const STEP = 2;
+const POINT_SPACING = 2;
 /** Distance from the first corner at which a click closes a polygon, CSS pixels. */
-const CLOSE = 9;
+const CLOSE_DISTANCE = 9;
 /** Milliseconds between the presses of a double click. */
-const TWICE = 400;
+const DOUBLE_CLICK_TIME = 400;
 
 /** How a shape changes the selection, by the modifier keys that image editors use.
  * @param {{ shiftKey: boolean, altKey: boolean }} event @returns {Mode} */
@@ -94,15 +94,16 @@ export class Tools extends EventTarget {
     const { camera, k } = this.stage.wanted;
     if (tool === "polygon") {
       const [first] = this.drawn?.points ?? [];
-      const close = first && Math.hypot(first[0] - at[0], first[1] - at[1]) < CLOSE * this.stage.pixel;
+      const close = first && Math.hypot(first[0] - at[0], first[1] - at[1]) < CLOSE_DISTANCE * this.stage.pixel;
       const last = this.drawn?.points.at(-1);
-      const again = last && event.timeStamp - this.pressed < TWICE && Math.hypot(last[0] - at[0], last[1] - at[1]) < CLOSE * this.stage.pixel;
+      const again = last && event.timeStamp - this.pressed < DOUBLE_CLICK_TIME
+        && Math.hypot(last[0] - at[0], last[1] - at[1]) < CLOSE_DISTANCE * this.stage.pixel;
       this.pressed = event.timeStamp;
       if (this.drawn && this.drawn.points.length > 2 && (close || again)) return this.finish();
       if (this.drawn) this.drawn.points.push(at);
       else this.drawn = { tool, points: [at], camera, k, mode };
-    } else if (LINES.includes(tool)) {
-      this.drawn = { tool, points: TWO.includes(tool) ? [at, at] : [at], camera, k, mode };
+    } else if (LINE_TOOLS.includes(tool)) {
+      this.drawn = { tool, points: TWO_POINT_TOOLS.includes(tool) ? [at, at] : [at], camera, k, mode };
     }
     this.changed();
   }
@@ -111,10 +112,10 @@ export class Tools extends EventTarget {
   move(at) {
     this.at = at;
     const drawn = this.drawn;
-    if (drawn && TWO.includes(drawn.tool)) drawn.points[1] = at;
-    else if (drawn && LINES.includes(drawn.tool)) {
+    if (drawn && TWO_POINT_TOOLS.includes(drawn.tool)) drawn.points[1] = at;
+    else if (drawn && LINE_TOOLS.includes(drawn.tool)) {
       const last = drawn.points[drawn.points.length - 1];
-      if (Math.hypot(at[0] - last[0], at[1] - last[1]) >= STEP * this.stage.pixel) drawn.points.push(at);
+      if (Math.hypot(at[0] - last[0], at[1] - last[1]) >= POINT_SPACING * this.stage.pixel) drawn.points.push(at);
     }
     if (drawn || this.tool === "brush") this.changed();
   }
@@ -122,7 +123,7 @@ export class Tools extends EventTarget {
   /** The pointer is released. @param {Point} at @param {PointerEvent} event */
   up(at, event) {
     const tool = this.tool;
-    if (tool && LINES.includes(tool)) this.finish();
+    if (tool && LINE_TOOLS.includes(tool)) this.finish();
     else if (tool && tool !== "polygon") this.touch(tool, at, modeOf(event));
   }
 
@@ -135,7 +136,7 @@ export class Tools extends EventTarget {
     const visible = state.get("visibleOnly");
     if (tool === "brush") return session.select([brush(camera, k, points, state.get("brush") * this.stage.pixel, visible)], mode);
     const [a, b] = points;
-    if (tool === "cut" && Math.hypot(b[0] - a[0], b[1] - a[1]) > CLOSE * this.stage.pixel) return session.select([beside(camera, k, a, b)], mode);
+    if (tool === "cut" && Math.hypot(b[0] - a[0], b[1] - a[1]) > CLOSE_DISTANCE * this.stage.pixel) return session.select([beside(camera, k, a, b)], mode);
     const outline = /** @type {Point[]} */ (tool === "rectangle" ? [a, [b[0], a[1]], b, [a[0], b[1]]] : points);
     if (area(outline) > 9) session.select([polygon(camera, k, outline, visible)], mode);
     // A click without a drag deselects everything, as in other editors.

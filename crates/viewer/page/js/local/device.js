@@ -5,7 +5,7 @@ import { shader } from "./assets.js";
 /** Threads of a workgroup. */
 export const GROUP = 256;
 /** Maximum number of workgroups along one axis. */
-const LINE = 65535;
+const MAX_WORKGROUPS = 65535;
 /** Maximum number of storage arrays that a kernel binds: those of `blend`. */
 const BINDINGS = 9;
 
@@ -122,7 +122,7 @@ export class Work {
     this.pass ??= this.encoder.beginComputePass();
     this.pass.setPipeline(pipeline);
     this.pass.setBindGroup(0, this.gpu.device.createBindGroup({ layout, entries }));
-    const rows = Math.ceil(groups / LINE);
+    const rows = Math.ceil(groups / MAX_WORKGROUPS);
     this.pass.dispatchWorkgroups(Math.ceil(groups / rows), rows);
   }
 

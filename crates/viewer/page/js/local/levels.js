@@ -7,13 +7,13 @@ import { axes, dot, subtract } from "../math.js";
 /** @typedef {import("../camera.js").Intrinsics} Intrinsics */
 
 /** Minimum number of splats of a level per covered pixel. */
-const DENSE = 2;
+const MIN_SPLATS_PER_PIXEL = 2;
 /** Number of positions used to estimate what a camera sees. */
-const SAMPLE = 4096;
+const SAMPLE_SIZE = 4096;
 /** Share of the splats in view that is left out on either side when the covered area is measured. */
-const OUTSIDE = 0.05;
+const TRIMMED_FRACTION = 0.05;
 /** Alignment of levels, splats: a row of WebGL2's textures. */
-const ALIGNED = 1024;
+const ALIGNMENT = 1024;
 
 export class Levels {
   /** Splats that have arrived, of the scene and of each level. @type {number[]} */
@@ -26,14 +26,14 @@ export class Levels {
   constructor(counts) {
     this.counts = counts;
     this.loaded = counts.map(() => 0);
-    this.step = Math.max(1, Math.ceil(counts[counts.length - 1] / SAMPLE));
+    this.step = Math.max(1, Math.ceil(counts[counts.length - 1] / SAMPLE_SIZE));
     /** First splat of the scene and of each level. @type {number[]} */
     this.starts = [];
     /** Room for all of them, splats. */
     this.room = 0;
     for (const count of counts) {
       this.starts.push(this.room);
-      this.room += ALIGNED * Math.ceil(count / ALIGNED);
+      this.room += ALIGNMENT * Math.ceil(count / ALIGNMENT);
     }
   }
 
@@ -51,7 +51,7 @@ export class Levels {
     if (coarsest === 0 || this.loaded[coarsest] < this.counts[coarsest]) return 0;
     const seen = this.splatsAPixel(camera, k, near) / this.counts[coarsest];
     let level = 0;
-    while (level < coarsest && seen * this.counts[level + 1] >= DENSE) level += 1;
+    while (level < coarsest && seen * this.counts[level + 1] >= MIN_SPLATS_PER_PIXEL) level += 1;
     return level;
   }
 
@@ -77,5 +77,5 @@ export class Levels {
 function extent(values) {
   const sorted = Float64Array.from(values).sort();
   const at = (/** @type {number} */ share) => sorted[Math.floor(sorted.length * share)] ?? 0;
-  return Math.max(1, at(1 - OUTSIDE) - at(OUTSIDE));
+  return Math.max(1, at(1 - TRIMMED_FRACTION) - at(TRIMMED_FRACTION));
 }

@@ -15,15 +15,15 @@ import { WebGpu } from "./webgpu.js";
 
 const NEAR = 0.01;
 /** The mode that both paint; only WebGL2 paints the others. */
-const PLAIN = "color";
+const COLOR_MODE = "color";
 /** Milliseconds after which a camera is at rest. */
-const REST = 100;
+const REST_DELAY = 100;
 /** Milliseconds for a picture of a moving camera. */
-const BUDGET = 33;
+const FRAME_BUDGET = 33;
 /** Milliseconds to wait until a newer version is complete. */
-const PATIENCE = 1500;
+const MAX_WAIT = 1500;
 /** Milliseconds until a selection that came before its splats is requested again. */
-const RETRY = 100;
+const RETRY_DELAY = 100;
 
 export class LocalRenderer {
   /** The current painter; null before the first one is open, and if there is none. @type {WebGpu | WebGl | null} */
@@ -125,10 +125,10 @@ export class LocalRenderer {
   }
 
   /** @param {string | undefined} mode */
-  painterOf(mode = PLAIN) {
+  painterOf(mode = COLOR_MODE) {
     // Nothing paints until it is known whether there is WebGPU.
     if (!this.opened) return null;
-    return this.gpu && mode === PLAIN && !this.holds ? this.gpu : this.openWebGl();
+    return this.gpu && mode === COLOR_MODE && !this.holds ? this.gpu : this.openWebGl();
   }
 
   /** Lets only WebGL2 paint, or again both. @param {boolean} holds */
@@ -263,7 +263,7 @@ export class LocalRenderer {
       this.masked = mask;
     }
     this.fetching = false;
-    if (this.masked !== this.mask) setTimeout(() => this.fetchMask(), RETRY);
+    if (this.masked !== this.mask) setTimeout(() => this.fetchMask(), RETRY_DELAY);
   }
 
   /** @param {Camera} camera @param {Intrinsics} k @param {any} shot */
@@ -293,7 +293,7 @@ export class LocalRenderer {
   /** The level for a moving camera: 0 if individual splats are shown, or selected ones are tinted.
    * @param {{ camera: Camera, shot: any }} wanted @param {Intrinsics} k */
   levelOf({ camera, shot }, k) {
-    const plain = (shot.mode ?? PLAIN) === PLAIN && !(shot.highlight && this.masked);
+    const plain = (shot.mode ?? COLOR_MODE) === COLOR_MODE && !(shot.highlight && this.masked);
     return plain ? this.levels.choose(camera, scaled(k, this.share), NEAR) : 0;
   }
 
@@ -309,8 +309,8 @@ export class LocalRenderer {
   /** @param {WebGpu | WebGl} painter @param {{ camera: Camera, shot: any }} wanted @param {Intrinsics} k @param {number} now */
   async paint(painter, wanted, k, now) {
     // A newer version replaces the picture when it is complete: a part of it would flicker at each edit.
-    if (this.loaded < this.total && this.complete && now < this.beganAt + PATIENCE) return;
-    const rests = now - this.changedAt >= REST;
+    if (this.loaded < this.total && this.complete && now < this.beganAt + MAX_WAIT) return;
+    const rests = now - this.changedAt >= REST_DELAY;
     this.useLevel(rests ? 0 : this.levelOf(wanted, k));
     const moving = !rests || painter.busy;
     if (moving && !this.fresh && this.painted === wanted) return;
@@ -318,7 +318,7 @@ export class LocalRenderer {
     const started = performance.now();
     const end = (/** @type {boolean} */ isThere) => {
       const spent = performance.now() - started;
-      if (moving) this.share = Math.min(1, Math.max(0.25, this.share * Math.min(1.15, Math.max(0.7, Math.sqrt(BUDGET / spent)))));
+      if (moving) this.share = Math.min(1, Math.max(0.25, this.share * Math.min(1.15, Math.max(0.7, Math.sqrt(FRAME_BUDGET / spent)))));
       if (!isThere || painter !== this.painter) return;
       if (painter.canvas !== this.element.firstChild) this.element.replaceChildren(painter.canvas);
       painter.present();
@@ -346,7 +346,7 @@ export class LocalRenderer {
       antialias: Boolean(this.scene?.antialias),
       clip: clip ?? null,
       highlight: Boolean(highlight && this.masked),
-      mode: mode ?? PLAIN,
+      mode: mode ?? COLOR_MODE,
       measured,
     };
   }

@@ -11,10 +11,10 @@ const SCAN_BLOCK = 2048;
 /** Keys of a block of the sort. */
 const SORT_BLOCK = 2048;
 /** Bits of a digit. */
-const DIGIT = 8;
-const DIGITS = 1 << DIGIT;
+const DIGIT_BITS = 8;
+const DIGITS = 1 << DIGIT_BITS;
 /** Number of digits per workgroup that sums counts. */
-const SUMMED = 8;
+const DIGITS_PER_GROUP = 8;
 
 /** Exclusive prefix sums of words. */
 export class Scan {
@@ -42,7 +42,7 @@ export class Sort {
   /** @param {Gpu} gpu @param {Record<string, Kernel>} kernels */
   constructor(gpu, kernels) {
     this.kernels = kernels;
-    this.passes = Array.from({ length: 32 / DIGIT }, () => new Words(gpu, "sort parameters", 4));
+    this.passes = Array.from({ length: 32 / DIGIT_BITS }, () => new Words(gpu, "sort parameters", 4));
     this.counts = new Words(gpu, "counts of digits");
     this.other = [new Words(gpu, "sorted keys"), new Words(gpu, "sorted values")];
   }
@@ -55,13 +55,13 @@ export class Sort {
     this.counts.reserve((blocks + 1) * DIGITS);
     for (const array of this.other) array.reserve(count);
     // An even number, so that the result ends up in the same arrays.
-    const passes = 2 * Math.ceil(bits / DIGIT / 2);
+    const passes = 2 * Math.ceil(bits / DIGIT_BITS / 2);
     const { sort_count, sort_starts, sort_scatter } = this.kernels;
     let [from, to] = [[keys, values], this.other];
     this.passes.slice(0, passes).forEach((params, i) => {
-      params.write(0, Uint32Array.of(count, blocks, DIGIT * i));
+      params.write(0, Uint32Array.of(count, blocks, DIGIT_BITS * i));
       work.run(sort_count, [params, from[0], this.counts], blocks);
-      work.run(sort_starts, [params, this.counts], DIGITS / SUMMED);
+      work.run(sort_starts, [params, this.counts], DIGITS / DIGITS_PER_GROUP);
       work.run(sort_scatter, [params, from[0], from[1], this.counts, to[0], to[1]], blocks);
       [from, to] = [to, from];
     });

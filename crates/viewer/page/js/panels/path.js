@@ -1,7 +1,7 @@
 // The panel of the camera path: key frames, timing, files.
 
 import { el, row, section } from "../dom.js";
-import { APART, path } from "../path.js";
+import { KEY_INTERVAL, path } from "../path.js";
 import { state } from "../state.js";
 
 class PathPanel extends HTMLElement {
@@ -59,7 +59,7 @@ class PathPanel extends HTMLElement {
     const count = Math.min(12, views.length);
     path.keys = Array.from({ length: count }, (_, i) => {
       const view = views[Math.floor((i * views.length) / count)];
-      return { time: APART * i, position: view.position, rotation: view.rotation, fov: 2 * Math.atan(view.height / 2 / view.fy) };
+      return { time: KEY_INTERVAL * i, position: view.position, rotation: view.rotation, fov: 2 * Math.atan(view.height / 2 / view.fy) };
     });
     path.changed();
   }

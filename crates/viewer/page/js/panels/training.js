@@ -8,7 +8,7 @@ import { state } from "../state.js";
 /** @typedef {import("../chart.js").Chart} Chart */
 
 /** Milliseconds between two updates of the curves. */
-const BETWEEN = 1000;
+const UPDATE_INTERVAL = 1000;
 const PHASES = { preparing: "Preparing", training: "Training", paused: "Paused", finished: "Finished" };
 
 class TrainingPanel extends HTMLElement {
@@ -63,7 +63,7 @@ class TrainingPanel extends HTMLElement {
     let shownAt = 0;
     state.watch(["train", "theme", "tab", "sidebar"], () => {
       const now = state.get("train");
-      const recent = performance.now() - shownAt < BETWEEN && now?.phase === "training";
+      const recent = performance.now() - shownAt < UPDATE_INTERVAL && now?.phase === "training";
       if (!now || recent || state.get("tab") !== "training" || !state.get("sidebar")) return;
       shownAt = performance.now();
       const of = (/** @type {string} */ key) => now.curve.filter((/** @type {any} */ point) => typeof point[key] === "number")

@@ -3,45 +3,45 @@
 use irradia_scene::Rng;
 
 /// The step of central differences, and the tolerance of a gradient v compared with a difference d:
-/// `|v - d| <= relative |d| + of_largest max |v| + absolute`.
+/// `|v - d| <= relative |d| + relative_to_max max |v| + absolute`.
 #[derive(Clone, Copy, Debug)]
-pub struct Differences {
+pub struct FiniteDifferences {
     /// Step to either side.
     pub step: f64,
     /// Tolerance relative to the difference.
     pub relative: f64,
     /// Tolerance relative to the gradient's largest coordinate.
-    pub of_largest: f64,
+    pub relative_to_max: f64,
     /// Absolute tolerance.
     pub absolute: f64,
 }
 
-impl Differences {
-    /// A tolerance of `of_largest` of the largest coordinate.
-    pub fn of_largest(step: f64, of_largest: f64) -> Self {
+impl FiniteDifferences {
+    /// A tolerance of `relative_to_max` of the largest coordinate.
+    pub fn relative_to_max(step: f64, relative_to_max: f64) -> Self {
         Self {
             step,
             relative: 0.0,
-            of_largest,
+            relative_to_max,
             absolute: 1e-9,
         }
     }
 
-    /// Checks the coordinates `which` of the gradient `v` of `value` at `at`; `at` may be longer than `v`.
+    /// Checks the coordinates `indices` of the gradient `v` of `value` at `at`; `at` may be longer than `v`.
     ///
     /// # Panics
     /// When a difference is out of tolerance.
     pub fn check(
         &self,
-        what: &str,
+        label: &str,
         at: &[f64],
         v: &[f64],
-        which: impl IntoIterator<Item = usize>,
+        indices: impl IntoIterator<Item = usize>,
         value: impl Fn(&[f64]) -> f64,
     ) {
         let largest = v.iter().fold(0.0f64, |m, v| m.max(v.abs()));
         let mut moved = at.to_vec();
-        for i in which {
+        for i in indices {
             let mut value_at = |by: f64| {
                 moved[i] = at[i] + by;
                 let value = value(&moved);
@@ -49,11 +49,11 @@ impl Differences {
                 value
             };
             let numeric = (value_at(self.step) - value_at(-self.step)) / (2.0 * self.step);
-            let allowed = self.relative * numeric.abs() + self.of_largest * largest + self.absolute;
+            let tolerance = self.relative * numeric.abs() + self.relative_to_max * largest + self.absolute;
             // NaN gradients must fail, too.
             assert!(
-                (numeric - v[i]).abs() <= allowed,
-                "{what}, value {i}: gradient {}, finite difference {numeric}; the largest gradient is {largest}",
+                (numeric - v[i]).abs() <= tolerance,
+                "{label}, value {i}: gradient {}, finite difference {numeric}; the largest gradient is {largest}",
                 v[i]
             );
         }
@@ -61,7 +61,7 @@ impl Differences {
 }
 
 /// About 200 of `n` coordinates, or all of them.
-pub fn some_of(n: usize) -> impl Iterator<Item = usize> {
+pub fn sample_indices(n: usize) -> impl Iterator<Item = usize> {
     (0..n).step_by(1 + n / 200)
 }
 
@@ -70,7 +70,7 @@ pub fn some_of(n: usize) -> impl Iterator<Item = usize> {
 ///
 /// # Panics
 /// When a difference is out of tolerance.
-pub fn directional(at: &[f64], v: &[f64], value: impl Fn(&[f64]) -> f64, step: f64, tolerance: f64) {
+pub fn check_directional(at: &[f64], v: &[f64], value: impl Fn(&[f64]) -> f64, step: f64, tolerance: f64) {
     assert_eq!(at.len(), v.len(), "the gradient matches the input's length");
     let length = v.iter().map(|v| v * v).sum::<f64>().sqrt();
     for seed in 0..8 {
@@ -100,19 +100,19 @@ mod tests {
 
     #[test]
     fn a_correct_gradient_passes() {
-        Differences::of_largest(1e-5, 1e-9).check("it", &AT, &GRADIENT, 0..2, value);
-        directional(&AT, &GRADIENT, value, 1e-5, 1e-9);
+        FiniteDifferences::relative_to_max(1e-5, 1e-9).check("it", &AT, &GRADIENT, 0..2, value);
+        check_directional(&AT, &GRADIENT, value, 1e-5, 1e-9);
     }
 
     #[test]
     #[should_panic(expected = "it, value 0: gradient 1.1")]
     fn a_wrong_coordinate_fails() {
-        Differences::of_largest(1e-5, 1e-3).check("it", &AT, &[1.1, 6.0], 0..2, value);
+        FiniteDifferences::relative_to_max(1e-5, 1e-3).check("it", &AT, &[1.1, 6.0], 0..2, value);
     }
 
     #[test]
     #[should_panic(expected = "direction 0")]
     fn a_nan_gradient_fails() {
-        directional(&AT, &[f64::NAN, 6.0], value, 1e-5, 1e-3);
+        check_directional(&AT, &[f64::NAN, 6.0], value, 1e-5, 1e-3);
     }
 }

@@ -8,17 +8,17 @@ use irradia_splat::{Gather, OutputGradient, RenderOptions, Renderer, SplatGradie
 use rayon::prelude::*;
 
 /// Length of the longer side of the pictures, pixels.
-const SIDE: f32 = 480.0;
+const MAX_SIDE: f32 = 480.0;
 /// Minimum sum of its blending weights, in pixels, for a splat to count as seen. The sum is 0 for a splat hidden behind others.
-pub(crate) const SEEN: f32 = 0.25;
+pub(crate) const MIN_VISIBLE_WEIGHT: f32 = 0.25;
 /// Pixels with a lower alpha have no depth.
-const COVERED: f32 = 0.5;
+const MIN_DEPTH_ALPHA: f32 = 0.5;
 
 /// Renders small pictures of some splats.
 pub(crate) struct Observer {
     splats: Splats,
     /// Index of each splat in the draft.
-    numbers: Vec<u32>,
+    indices: Vec<u32>,
     /// Number of splats of the draft.
     count: usize,
     options: RenderOptions,
@@ -30,7 +30,7 @@ pub(crate) struct Observer {
 /// Mean depth along +Z in each pixel of a picture.
 pub(crate) struct Depths {
     camera: Camera,
-    /// `[H, W]`, world units; infinite where alpha is below [`COVERED`].
+    /// `[H, W]`, world units; infinite where alpha is below [`MIN_DEPTH_ALPHA`].
     depth: Vec<f32>,
 }
 
@@ -51,10 +51,10 @@ impl Depths {
 impl Observer {
     /// An observer of the splats `of`.
     pub fn new(draft: &Draft, of: &Selection) -> Self {
-        let numbers = of.indices();
+        let indices = of.indices();
         Self {
-            splats: Splats::from_cloud(&gather(&draft.cloud, &numbers)),
-            numbers,
+            splats: Splats::from_cloud(&gather(&draft.cloud, &indices)),
+            indices,
             count: draft.len(),
             options: RenderOptions {
                 antialias: draft.cloud.antialiased,
@@ -73,7 +73,7 @@ impl Observer {
         let k = camera.intrinsics;
         let longest = k.width.max(k.height) as f32;
         let camera = Camera {
-            intrinsics: k.scaled((SIDE / longest).min(1.0)),
+            intrinsics: k.scaled((MAX_SIDE / longest).min(1.0)),
             ..*camera
         };
         self.renderer
@@ -85,7 +85,7 @@ impl Observer {
     pub fn depths(&mut self, camera: &Camera) -> Depths {
         let camera = self.render(camera);
         let pixels = self.renderer.depth().iter().zip(self.renderer.alpha());
-        let mean = |(depth, alpha): (&f32, &f32)| match *alpha >= COVERED {
+        let mean = |(depth, alpha): (&f32, &f32)| match *alpha >= MIN_DEPTH_ALPHA {
             true => depth / alpha,
             false => f32::INFINITY,
         };
@@ -107,7 +107,7 @@ impl Observer {
         };
         self.renderer.backward(&self.splats, &gradient, &mut self.gradients);
         let mut weights = vec![0.0; self.count];
-        for (i, number) in self.numbers.iter().enumerate() {
+        for (i, number) in self.indices.iter().enumerate() {
             if self.gradients.active[i] > 0.0 {
                 weights[*number as usize] = self.gradients.gathered.get(1, i);
             }
@@ -117,13 +117,13 @@ impl Observer {
 }
 
 /// The number of the draft's cameras that see each splat.
-pub(crate) fn views_that_see(draft: &Draft) -> Vec<u32> {
+pub(crate) fn count_seeing_views(draft: &Draft) -> Vec<u32> {
     let mut observer = Observer::new(draft, &draft.visible());
     let mut views = vec![0; draft.len()];
     for camera in &draft.cameras {
         let weights = observer.weights(camera);
         let each = views.par_iter_mut().zip(weights).with_min_len(1024);
-        each.for_each(|(views, weight)| *views += u32::from(weight >= SEEN));
+        each.for_each(|(views, weight)| *views += u32::from(weight >= MIN_VISIBLE_WEIGHT));
     }
     views
 }

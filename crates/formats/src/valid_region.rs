@@ -5,18 +5,18 @@ use irradia_scene::{Intrinsics, Lens};
 use std::f64::consts::PI;
 
 /// Distance from the axis up to which a perspective lens is searched for its fold: the tangent of 80 degrees.
-const STEEPEST: f64 = 5.671;
+const MAX_TANGENT: f64 = 5.671;
 /// Maximum angle of a fisheye from its axis, radians: straight behind the camera, the position in the photograph is ambiguous.
-const ALMOST_BEHIND: f64 = PI - 1e-6;
+const MAX_FISHEYE_ANGLE: f64 = PI - 1e-6;
 /// Maximum latitude used of a panorama, radians: beyond it, splats cover many longitudes, which their affine approximations do not
 /// follow. 75 degrees leave out 3 % of all directions.
-const HIGHEST: f64 = 75.0 * PI / 180.0;
+const MAX_LATITUDE: f64 = 75.0 * PI / 180.0;
 /// Maximum longitude used of a panorama, radians (176 degrees): a splat that crosses the edge straight behind appears on one side only.
-const FARTHEST: f64 = 176.0 * PI / 180.0;
+const MAX_LONGITUDE: f64 = 176.0 * PI / 180.0;
 
 /// The part of a camera's photographs that is compared with renderings through its lens.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Shown {
+pub(crate) struct ValidRegion {
     source: Intrinsics,
     region: Region,
 }
@@ -34,12 +34,12 @@ impl Region {
     fn contains(self, at: DVec2) -> bool {
         match self {
             Region::Disc(radius) => at.length() <= radius,
-            Region::Band => at.x.abs() <= FARTHEST && at.y.abs() <= HIGHEST,
+            Region::Band => at.x.abs() <= MAX_LONGITUDE && at.y.abs() <= MAX_LATITUDE,
         }
     }
 }
 
-impl Shown {
+impl ValidRegion {
     /// The usable part of photographs by `source`; `None` if all of it is usable. `rim` gives the angle from the axis, radians, at which
     /// photographs of a fisheye become black.
     pub fn of(source: &Intrinsics, rim: impl FnOnce() -> Option<f64>) -> Option<Self> {
@@ -47,15 +47,15 @@ impl Shown {
         let region = match lens {
             Lens::Equirectangular => Region::Band,
             Lens::Fisheye { .. } => {
-                let reach = lens.reach_in_angle().min(ALMOST_BEHIND);
-                Region::Disc(lens.radius_of_angle(rim().map_or(reach, |rim| rim.min(reach))))
+                let max_angle = lens.reach_in_angle().min(MAX_FISHEYE_ANGLE);
+                Region::Disc(lens.radius_of_angle(rim().map_or(max_angle, |rim| rim.min(max_angle))))
             }
             _ => {
-                let reach = lens.reach_on_plane(STEEPEST);
-                if reach.is_infinite() {
+                let max_radius = lens.reach_on_plane(MAX_TANGENT);
+                if max_radius.is_infinite() {
                     return None;
                 }
-                Region::Disc(lens.radius_of_angle(reach.atan()))
+                Region::Disc(lens.radius_of_angle(max_radius.atan()))
             }
         };
         let (right, lower) = (f64::from(source.width), f64::from(source.height));
@@ -70,7 +70,7 @@ impl Shown {
     }
 
     /// Masks everything else in a photograph of this size; creates the mask if there is none.
-    pub fn restrict(&self, width: u32, height: u32, mask: &mut Option<Vec<u8>>) {
+    pub fn restrict_mask(&self, width: u32, height: u32, mask: &mut Option<Vec<u8>>) {
         let k = self.source.resized(width, height);
         let mask = mask.get_or_insert_with(|| vec![255; width as usize * height as usize]);
         for (row, y) in mask.chunks_exact_mut(width as usize).zip(0u32..) {
@@ -111,9 +111,9 @@ mod tests {
         };
         // The maximum of r - 0.3 r^3 is 0.7027, at r = 1.0541.
         for (lens, rim, radius) in [(fisheye, Some(1.2), 1.2), (folding, None, 0.7027)] {
-            let shown = Shown::of(&camera(lens), || rim).expect("corners are beyond");
+            let region = ValidRegion::of(&camera(lens), || rim).expect("corners are beyond");
             let mut mask = None;
-            shown.restrict(100, 50, &mut mask);
+            region.restrict_mask(100, 50, &mut mask);
             let mask = mask.expect("made");
             for (at, value) in mask.iter().enumerate() {
                 let [x, y] = [at % 100, at / 100].map(|v| v as f64 + 0.5);
@@ -122,9 +122,9 @@ mod tests {
             }
         }
         let mut mask = Some(vec![0; 5000]);
-        Shown::of(&camera(fisheye), || Some(1.2))
+        ValidRegion::of(&camera(fisheye), || Some(1.2))
             .unwrap()
-            .restrict(100, 50, &mut mask);
+            .restrict_mask(100, 50, &mut mask);
         assert_eq!(mask, Some(vec![0; 5000]), "what is masked stays masked");
     }
 
@@ -136,7 +136,9 @@ mod tests {
             ..camera(Lens::Equirectangular)
         };
         let mut mask = None;
-        Shown::of(&panorama, || None).unwrap().restrict(200, 100, &mut mask);
+        ValidRegion::of(&panorama, || None)
+            .unwrap()
+            .restrict_mask(200, 100, &mut mask);
         let mask = mask.unwrap();
         let kept = |row: usize, column: usize| mask[row * 200 + column] == 255;
         // 1.8 degrees per pixel.
@@ -151,7 +153,7 @@ mod tests {
             p: [0.0; 2],
         };
         for lens in [Lens::Pinhole, Lens::Fov { omega: 0.9 }, barrel, Lens::fisheye([0.0; 4])] {
-            assert_eq!(Shown::of(&camera(lens), || None), None, "{lens:?}");
+            assert_eq!(ValidRegion::of(&camera(lens), || None), None, "{lens:?}");
         }
     }
 }

@@ -1,6 +1,6 @@
 //! Views of a dataset in the form that the mapper needs: with their features, cameras and poses.
 
-use super::stages::{both, color_at, in_grey};
+use super::stages::{color_at, combine_masks, to_grey};
 use irradia_scene::{Camera, View};
 use irradia_sfm::Features;
 use irradia_sfm::features::{Extractor, GreyPhoto, Sift};
@@ -9,7 +9,7 @@ use irradia_sfm::geometry::pose::DPose;
 use irradia_sfm::map::PhotoInfo;
 
 /// A view at the size at which its features were found.
-pub(super) struct Look {
+pub(super) struct ViewFeatures {
     /// The photograph's camera is known; the group is 0.
     pub info: PhotoInfo,
     pub features: Features,
@@ -17,9 +17,9 @@ pub(super) struct Look {
     pub colors: Vec<[u8; 3]>,
 }
 
-impl Look {
+impl ViewFeatures {
     /// Finds the features of `view`, reduced to at most `side` pixels on its longer side; `None` if its photograph cannot be read.
-    pub fn at(view: &View, side: u32, max_features: usize) -> Option<Self> {
+    pub fn extract(view: &View, side: u32, max_features: usize) -> Option<Self> {
         let full = view.camera.intrinsics;
         let k = full.scaled((side as f32 / full.width.max(full.height) as f32).min(1.0));
         let photo = view.photo.load_at(k.width, k.height).ok()?;
@@ -27,11 +27,11 @@ impl Look {
             max_features,
             ..Sift::default()
         };
-        let mask = both(photo.mask.clone(), photo.alpha());
+        let mask = combine_masks(photo.mask.clone(), photo.alpha());
         let features = sift.extract(&GreyPhoto {
             width: photo.width,
             height: photo.height,
-            data: &in_grey(&photo.data, photo.channels),
+            data: &to_grey(&photo.data, photo.channels),
             mask: mask.as_deref(),
         });
         let info = PhotoInfo {

@@ -8,20 +8,20 @@ use irradia_train::socket::Vignette;
 use std::sync::Arc;
 
 /// Maximum number of views: they stay in memory.
-const MOST: usize = 64;
+const MAX_VIEWS: usize = 64;
 /// Number of neighbours with which a view is paired.
 const NEIGHBOURS: usize = 2;
 /// Maximum angle between two paired views, radians.
-const SAME_WAY: f32 = 1.0;
+const MAX_ANGLE_RADIANS: f32 = 1.0;
 
 /// `dataset` with renders of `scene`, with the lenses' vignette, as additional training views halfway between adjacent views. A scene
 /// trained on them looks between the photographs as it did before. On lund_door, 10 photographs, at a 25th of the bytes: held-out PSNR
 /// 33.65 dB without, 33.82 dB with one neighbour of each.
-pub(super) fn with_views_between(mut dataset: Dataset, scene: &Scene, vignette: Option<&Vignette>) -> Dataset {
+pub(super) fn with_interpolated_views(mut dataset: Dataset, scene: &Scene, vignette: Option<&Vignette>) -> Dataset {
     let cameras: Vec<Camera> = dataset.train.iter().map(|i| dataset.views[*i].camera).collect();
     let pairs = adjacent(&cameras);
     let mut renderer = Renderer::new();
-    for (a, b) in pairs.iter().step_by(pairs.len().div_ceil(MOST).max(1)) {
+    for (a, b) in pairs.iter().step_by(pairs.len().div_ceil(MAX_VIEWS).max(1)) {
         let (own, other) = (cameras[*a].pose, cameras[*b].pose);
         let pose = Pose {
             rotation: own.rotation.slerp(other.rotation, 0.5),
@@ -56,7 +56,7 @@ fn adjacent(cameras: &[Camera]) -> Vec<(usize, usize)> {
     for (i, own) in cameras.iter().enumerate() {
         let looks_alike = |other: &usize| {
             let angle = own.pose.rotation.angle_between(cameras[*other].pose.rotation);
-            *other != i && angle < SAME_WAY
+            *other != i && angle < MAX_ANGLE_RADIANS
         };
         let mut near: Vec<usize> = (0..cameras.len()).filter(looks_alike).collect();
         let distance = |other: &usize| cameras[*other].pose.position.distance_squared(own.pose.position);

@@ -1,6 +1,6 @@
 //! Files that each belong to one image, in a folder beside that of the images: masks, depth maps and normal maps.
 
-use super::declared::{Declared, DeclaredView};
+use super::declared::{DeclaredDataset, DeclaredView};
 use super::files::{is_image_name, relative_name};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -9,13 +9,13 @@ use std::path::{Path, PathBuf};
 const MAX_DEPTH: u32 = 6;
 
 /// The files in a separate folder, by the image that they belong to.
-pub struct Beside {
+pub struct SiblingFolder {
     folder: String,
     /// By path below the folder, lower case, without extension.
     by_stem: HashMap<String, PathBuf>,
 }
 
-impl Beside {
+impl SiblingFolder {
     /// The masks of the images in `root/images`: in `masks` with the suffix of `images` in its name (`masks_4` for `images_4`),
     /// else in `masks`.
     pub fn masks(root: &Path, images: &str) -> Option<Self> {
@@ -53,7 +53,7 @@ impl Beside {
 
     /// The file of the image with this path below its folder: the same name, `NAME_mask`, or the full file name with another
     /// extension appended (COLMAP's `0001.jpg.png`).
-    pub fn of(&self, image: &str) -> Option<PathBuf> {
+    pub fn file_of(&self, image: &str) -> Option<PathBuf> {
         let image = image.to_lowercase();
         let stem = without_extension(&image);
         let keys = [stem, &format!("{stem}_mask"), &image];
@@ -61,8 +61,9 @@ impl Beside {
     }
 
     /// The file of `view`, whose name may begin with the folder of the photographs.
-    fn of_view(&self, view: &DeclaredView) -> Option<PathBuf> {
-        self.of(&view.name).or_else(|| self.of(view.name_below()))
+    fn file_of_view(&self, view: &DeclaredView) -> Option<PathBuf> {
+        self.file_of(&view.name)
+            .or_else(|| self.file_of(view.name_without_folder()))
     }
 
     /// The warning if some images have no mask.
@@ -78,12 +79,12 @@ impl Beside {
 }
 
 /// Gives views without a mask theirs in `masks` below the dataset's folder, if there is one.
-pub(super) fn find_masks(declared: &mut Declared) {
-    let Some(masks) = Beside::masks(&declared.root, "images") else {
+pub(super) fn find_masks(declared: &mut DeclaredDataset) {
+    let Some(masks) = SiblingFolder::masks(&declared.root, "images") else {
         return;
     };
     for view in declared.views.iter_mut().filter(|view| view.mask.is_none()) {
-        view.mask = masks.of_view(view);
+        view.mask = masks.file_of_view(view);
     }
     let masked = declared.views.iter().filter(|view| view.mask.is_some()).count();
     let warning = masks.mask_warning(declared.views.len(), masked);
@@ -91,11 +92,13 @@ pub(super) fn find_masks(declared: &mut Declared) {
 }
 
 /// Gives views the depth maps below the dataset's folder if its files declare none, and likewise the normal maps.
-pub(super) fn find_maps(declared: &mut Declared) {
-    let depths = Beside::depths(&declared.root).filter(|_| declared.views.iter().all(|view| view.depth.is_none()));
-    let normals = Beside::normals(&declared.root).filter(|_| declared.views.iter().all(|view| view.normals.is_none()));
+pub(super) fn find_maps(declared: &mut DeclaredDataset) {
+    let depths =
+        SiblingFolder::depths(&declared.root).filter(|_| declared.views.iter().all(|view| view.depth.is_none()));
+    let normals =
+        SiblingFolder::normals(&declared.root).filter(|_| declared.views.iter().all(|view| view.normals.is_none()));
     for view in &mut declared.views {
-        let [depth, normals] = [&depths, &normals].map(|maps| maps.as_ref()?.of_view(view));
+        let [depth, normals] = [&depths, &normals].map(|maps| maps.as_ref()?.file_of_view(view));
         view.depth = view.depth.take().or(depth);
         view.normals = view.normals.take().or(normals);
     }
@@ -142,9 +145,11 @@ mod tests {
         for name in ["a.png", "b.npy", "c.txt"] {
             std::fs::write(root.path().join("depths").join(name), b"").unwrap();
         }
-        let depths = Beside::depths(root.path()).unwrap();
-        assert!(depths.of("A.jpg").unwrap().ends_with("a.png") && depths.of("b.jpg").unwrap().ends_with("b.npy"));
-        assert_eq!(depths.of("c.jpg"), None);
+        let depths = SiblingFolder::depths(root.path()).unwrap();
+        assert!(
+            depths.file_of("A.jpg").unwrap().ends_with("a.png") && depths.file_of("b.jpg").unwrap().ends_with("b.npy")
+        );
+        assert_eq!(depths.file_of("c.jpg"), None);
     }
 
     #[test]
@@ -154,17 +159,17 @@ mod tests {
         for name in ["A.png", "b_mask.JPG", "c.jpg.png", "sub/d.png"] {
             std::fs::write(root.path().join("masks_2").join(name), b"").unwrap();
         }
-        let masks = Beside::masks(root.path(), "images_2").unwrap();
+        let masks = SiblingFolder::masks(root.path(), "images_2").unwrap();
         for (image, mask) in [
             ("a.JPG", "A.png"),
             ("b.png", "b_mask.JPG"),
             ("c.jpg", "c.jpg.png"),
             ("sub/d.jpg", "sub/d.png"),
         ] {
-            assert!(masks.of(image).unwrap().ends_with(mask), "{image}");
+            assert!(masks.file_of(image).unwrap().ends_with(mask), "{image}");
         }
-        assert_eq!(masks.of("d.jpg"), None);
+        assert_eq!(masks.file_of("d.jpg"), None);
         assert!(masks.mask_warning(5, 4).unwrap().contains("1 of 5"));
-        assert!(Beside::masks(root.path(), "images").is_none());
+        assert!(SiblingFolder::masks(root.path(), "images").is_none());
     }
 }

@@ -28,14 +28,14 @@ impl Settings {
     }
 
     /// Size of a feature, bytes.
-    fn feature(self) -> usize {
+    fn feature_bytes(self) -> usize {
         16 + DESCRIPTOR_BYTES * (1 + usize::from(self.frontal)) + 3
     }
 }
 
 /// The features of a photograph, their colours, and statistics of its pixels.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct Looks {
+pub(super) struct PhotoFeatures {
     /// In pixels at full size.
     pub features: Features,
     /// `[N]`
@@ -45,15 +45,15 @@ pub(super) struct Looks {
 
 /// The results of an earlier call.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct Known {
+pub(super) struct StoredFeatures {
     /// By the photograph's hash.
-    pub looks: HashMap<u64, Looks>,
+    pub photos: HashMap<u64, PhotoFeatures>,
     /// By the hashes of both photographs.
     pub matches: HashMap<[u64; 2], Vec<[u32; 2]>>,
 }
 
 /// The content of the file at `path` if it was written with the same `settings`, otherwise nothing; and a warning if it is damaged.
-pub(super) fn read(path: &Path, settings: Settings) -> (Known, Option<String>) {
+pub(super) fn read(path: &Path, settings: Settings) -> (StoredFeatures, Option<String>) {
     let Ok(bytes) = std::fs::read(path) else {
         return Default::default();
     };
@@ -61,9 +61,9 @@ pub(super) fn read(path: &Path, settings: Settings) -> (Known, Option<String>) {
         return Default::default();
     };
     match parse(rest, settings) {
-        Some(known) => (known, None),
+        Some(stored) => (stored, None),
         None => (
-            Known::default(),
+            StoredFeatures::default(),
             Some(format!("{} is damaged; features are extracted again", path.display())),
         ),
     }
@@ -119,36 +119,36 @@ fn write_u64(out: &mut dyn Write, value: u64) -> io::Result<()> {
 }
 
 /// What follows the header; `None` if it is damaged.
-fn parse(mut bytes: &[u8], settings: Settings) -> Option<Known> {
-    let mut known = Known::default();
+fn parse(mut bytes: &[u8], settings: Settings) -> Option<StoredFeatures> {
+    let mut stored = StoredFeatures::default();
     for _ in 0..take_u64(&mut bytes)? {
         let hash = take_u64(&mut bytes)?;
-        let figures = take(&mut bytes, 20)?.as_chunks::<4>().0;
-        let figures: [f32; 5] = std::array::from_fn(|i| f32::from_le_bytes(figures[i]));
+        let values = take_bytes(&mut bytes, 20)?.as_chunks::<4>().0;
+        let values: [f32; 5] = std::array::from_fn(|i| f32::from_le_bytes(values[i]));
         let count = usize::try_from(take_u64(&mut bytes)?).ok()?;
-        let mut looks = Looks {
-            appearance: Appearance::from_array(figures),
-            ..Looks::default()
+        let mut photo = PhotoFeatures {
+            appearance: Appearance::from_array(values),
+            ..PhotoFeatures::default()
         };
-        let size = settings.feature();
-        for feature in take(&mut bytes, count.checked_mul(size)?)?.chunks_exact(size) {
+        let size = settings.feature_bytes();
+        for feature in take_bytes(&mut bytes, count.checked_mul(size)?)?.chunks_exact(size) {
             let (place, rest) = feature.split_at(16);
             let value = |i: usize| f32::from_le_bytes(place[4 * i..][..4].try_into().expect("4 bytes"));
             let [x, y, scale, angle] = [0, 1, 2, 3].map(value);
-            looks.features.keypoints.push(Keypoint { x, y, scale, angle });
-            looks.features.descriptors.push(*rest.first_chunk()?);
+            photo.features.keypoints.push(Keypoint { x, y, scale, angle });
+            photo.features.descriptors.push(*rest.first_chunk()?);
             if settings.frontal {
-                looks.features.frontal.push(*rest[DESCRIPTOR_BYTES..].first_chunk()?);
+                photo.features.frontal.push(*rest[DESCRIPTOR_BYTES..].first_chunk()?);
             }
-            looks.colors.push(*rest.last_chunk()?);
+            photo.colors.push(*rest.last_chunk()?);
         }
-        known.looks.insert(hash, looks);
+        stored.photos.insert(hash, photo);
     }
     for _ in 0..take_u64(&mut bytes)? {
         let pair = [take_u64(&mut bytes)?, take_u64(&mut bytes)?];
         let count = usize::try_from(take_u64(&mut bytes)?).ok()?;
-        let counts = pair.map(|hash| known.looks.get(&hash).map_or(0, |looks| looks.colors.len()));
-        let matches: Vec<[u32; 2]> = take(&mut bytes, count.checked_mul(8)?)?
+        let counts = pair.map(|hash| stored.photos.get(&hash).map_or(0, |photo| photo.colors.len()));
+        let matches: Vec<[u32; 2]> = take_bytes(&mut bytes, count.checked_mul(8)?)?
             .as_chunks::<8>()
             .0
             .iter()
@@ -160,19 +160,19 @@ fn parse(mut bytes: &[u8], settings: Settings) -> Option<Known> {
         {
             return None;
         }
-        known.matches.insert(pair, matches);
+        stored.matches.insert(pair, matches);
     }
-    bytes.is_empty().then_some(known)
+    bytes.is_empty().then_some(stored)
 }
 
-fn take<'a>(bytes: &mut &'a [u8], count: usize) -> Option<&'a [u8]> {
+fn take_bytes<'a>(bytes: &mut &'a [u8], count: usize) -> Option<&'a [u8]> {
     let (taken, rest) = bytes.split_at_checked(count)?;
     *bytes = rest;
     Some(taken)
 }
 
 fn take_u64(bytes: &mut &[u8]) -> Option<u64> {
-    Some(u64::from_le_bytes(*take(bytes, 8)?.first_chunk()?))
+    Some(u64::from_le_bytes(*take_bytes(bytes, 8)?.first_chunk()?))
 }
 
 #[cfg(test)]
@@ -184,14 +184,14 @@ mod tests {
         frontal: false,
     };
 
-    fn looks(n: u8) -> Looks {
+    fn photo(n: u8) -> PhotoFeatures {
         let keypoint = |i: u8| Keypoint {
             x: i.into(),
             y: 0.5,
             scale: 2.0,
             angle: -1.0,
         };
-        Looks {
+        PhotoFeatures {
             features: Features {
                 keypoints: (0..n).map(keypoint).collect(),
                 descriptors: (0..n).map(|i| [i; DESCRIPTOR_BYTES]).collect(),
@@ -202,26 +202,26 @@ mod tests {
         }
     }
 
-    fn known() -> Known {
-        Known {
-            looks: HashMap::from([(7, looks(3)), (u64::MAX, looks(2)), (8, looks(0))]),
+    fn stored() -> StoredFeatures {
+        StoredFeatures {
+            photos: HashMap::from([(7, photo(3)), (u64::MAX, photo(2)), (8, photo(0))]),
             matches: HashMap::from([([7, u64::MAX], vec![[0, 1], [2, 0]]), ([7, 8], Vec::new())]),
         }
     }
 
-    fn save(path: &Path, settings: Settings, known: &Known) {
-        let photos: Vec<Photo> = (known.looks.iter())
-            .map(|(hash, looks)| (*hash, &looks.features, &looks.colors[..], looks.appearance))
+    fn save(path: &Path, settings: Settings, stored: &StoredFeatures) {
+        let photos: Vec<Photo> = (stored.photos.iter())
+            .map(|(hash, photo)| (*hash, &photo.features, &photo.colors[..], photo.appearance))
             .collect();
-        write(path, settings, &photos, &known.matches).unwrap();
+        write(path, settings, &photos, &stored.matches).unwrap();
     }
 
     #[test]
     fn what_is_written_is_read_back_under_the_same_settings_only() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("features.bin");
-        save(&path, SETTINGS, &known());
-        assert_eq!(read(&path, SETTINGS), (known(), None));
+        save(&path, SETTINGS, &stored());
+        assert_eq!(read(&path, SETTINGS), (stored(), None));
         let mut other = SETTINGS;
         other.extractor[3] = 5;
         let frontal = Settings {
@@ -233,10 +233,10 @@ mod tests {
         }
         assert_eq!(read(&folder.path().join("none"), SETTINGS), Default::default());
 
-        let mut seen_from_the_front = known();
-        for looks in seen_from_the_front.looks.values_mut() {
-            let of = looks.features.descriptors.iter();
-            looks.features.frontal = of.map(|descriptor| descriptor.map(|byte| byte + 100)).collect();
+        let mut seen_from_the_front = stored();
+        for photo in seen_from_the_front.photos.values_mut() {
+            let of = photo.features.descriptors.iter();
+            photo.features.frontal = of.map(|descriptor| descriptor.map(|byte| byte + 100)).collect();
         }
         save(&path, frontal, &seen_from_the_front);
         assert_eq!(read(&path, frontal), (seen_from_the_front, None));
@@ -246,16 +246,16 @@ mod tests {
     fn damage_is_noticed_and_forgotten() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("features.bin");
-        save(&path, SETTINGS, &known());
+        save(&path, SETTINGS, &stored());
         let whole = std::fs::read(&path).unwrap();
         for length in SETTINGS.header().len()..whole.len() {
             std::fs::write(&path, &whole[..length]).unwrap();
             let (read, warning) = read(&path, SETTINGS);
-            assert_eq!(read, Known::default(), "{length}");
+            assert_eq!(read, StoredFeatures::default(), "{length}");
             assert!(warning.is_some_and(|line| line.contains("damaged")), "{length}");
         }
         // A match with a feature that does not exist.
-        let mut broken = known();
+        let mut broken = stored();
         broken.matches.insert([8, 7], vec![[0, 0]]);
         save(&path, SETTINGS, &broken);
         assert!(read(&path, SETTINGS).1.is_some());

@@ -1,6 +1,6 @@
 //! The editing thread.
 
-use super::save::{Rest, Saved, save};
+use super::save::{Saved, UnsavedEdits, save};
 use super::session::Session;
 use super::{Editing, EditingError};
 use crate::message::EditRequest;
@@ -14,26 +14,26 @@ use std::path::Path;
 use std::sync::Arc;
 
 /// Maximum number of entries of the list that pages are told: those around the current position.
-const LISTED: usize = 120;
+const MAX_LISTED_ENTRIES: usize = 120;
 
 /// A session, and what is shown of it.
-struct Bench {
+struct Workspace {
     session: Session,
     options: RenderOptions,
     /// Whether the scene is shown as it was opened.
     before: bool,
     saved: Option<Saved>,
-    rest: Rest,
+    unsaved: UnsavedEdits,
     /// Whether the last attempt to keep the unsaved edits has failed, which pages are told once.
-    fails: bool,
+    has_save_failed: bool,
     /// What was shown last: splats, selection and its number, which is 0 if nothing is selected.
     shown: Option<(Arc<Draft>, Option<Arc<Selection>>)>,
     mask: u64,
-    masks: u64,
+    last_mask: u64,
 }
 
 /// The state that pages are told of a scene of `splats` splats before the first request.
-pub(super) fn untouched(splats: usize) -> Value {
+pub(super) fn initial_state(splats: usize) -> Value {
     json!({
         "tell": "editing", "selected": 0, "of": splats, "hidden": 0, "locked": 0, "box": null, "at": 0, "first": 0, "total": 0,
         "entries": [], "gesture": 0, "before": false, "busy": false, "mask": 0, "saved": null,
@@ -42,39 +42,44 @@ pub(super) fn untouched(splats: usize) -> Value {
 
 /// Carries out the requests of pages until `editing` closes. `tell` sends a line to a page, `wake` wakes the drawing thread. Returns a line
 /// about unsaved edits, if there are any.
-pub(crate) fn work(editing: &Editing, subject: &Subject, tell: &dyn Fn(u64, &str), wake: &dyn Fn()) -> Option<String> {
-    let mut bench: Option<Bench> = None;
-    while let Some((seat, request)) = editing.next() {
-        let mut told = (*editing.told.borrow()).as_ref().clone();
-        told["busy"] = true.into();
-        editing.tell(told.clone());
-        let outcome = match &mut bench {
-            Some(bench) => bench.answer(editing, &request),
-            none => Bench::open(editing, subject).and_then(|opened| none.insert(opened).answer(editing, &request)),
+pub(crate) fn run_editing(
+    editing: &Editing,
+    subject: &Subject,
+    tell: &dyn Fn(u64, &str),
+    wake: &dyn Fn(),
+) -> Option<String> {
+    let mut workspace: Option<Workspace> = None;
+    while let Some((client, request)) = editing.next() {
+        let mut state = (*editing.state.borrow()).as_ref().clone();
+        state["busy"] = true.into();
+        editing.publish(state.clone());
+        let outcome = match &mut workspace {
+            Some(workspace) => workspace.handle(editing, &request),
+            none => Workspace::open(editing, subject).and_then(|opened| none.insert(opened).handle(editing, &request)),
         };
         match outcome {
-            Ok(Some(line)) => tell(seat, &line),
+            Ok(Some(line)) => tell(client, &line),
             Ok(None) => {}
-            Err(error) => tell(seat, &error.to_string()),
+            Err(error) => tell(client, &error.to_string()),
         }
-        told["busy"] = false.into();
-        if let Some(bench) = &mut bench {
-            bench.show(subject);
-            editing.keep(bench.session.draft(), bench.session.list());
-            let failed_before = bench.fails;
-            if let Err(error) = bench.keep_rest(editing)
+        state["busy"] = false.into();
+        if let Some(workspace) = &mut workspace {
+            workspace.show(subject);
+            editing.set_current(workspace.session.draft(), workspace.session.list());
+            let failed_before = workspace.has_save_failed;
+            if let Err(error) = workspace.write_unsaved(editing)
                 && !failed_before
             {
-                tell(seat, &format!("unsaved edits would be lost in a crash: {error}"));
+                tell(client, &format!("unsaved edits would be lost in a crash: {error}"));
             }
-            told = bench.to_json();
+            state = workspace.to_json();
         }
         wake();
-        editing.tell(told);
+        editing.publish(state);
     }
-    let mut bench = bench?;
-    let kept = bench.keep_rest(editing);
-    match (bench.rest.path().map(Path::display), kept) {
+    let mut workspace = workspace?;
+    let kept = workspace.write_unsaved(editing);
+    match (workspace.unsaved.path().map(Path::display), kept) {
         (None, Ok(())) => None,
         (Some(path), Ok(())) => Some(format!(
             "unsaved edits are in {path}: use Open edits to make them again"
@@ -84,7 +89,7 @@ pub(crate) fn work(editing: &Editing, subject: &Subject, tell: &dyn Fn(u64, &str
     }
 }
 
-impl Bench {
+impl Workspace {
     fn open(editing: &Editing, subject: &Subject) -> Result<Self, EditingError> {
         let cloud = read_splats(&editing.source)?;
         let edition = subject.edition();
@@ -98,18 +103,18 @@ impl Bench {
             options: scene.map_or_else(RenderOptions::default, |scene| scene.options),
             before: false,
             saved: None,
-            rest: Rest::default(),
-            fails: false,
+            unsaved: UnsavedEdits::default(),
+            has_save_failed: false,
             // What is drawn was read from the same file.
             shown: (drawn == Some(session.draft().len())).then(|| (session.original().clone(), None)),
             session,
             mask: 0,
-            masks: 0,
+            last_mask: 0,
         })
     }
 
     /// Carries out a request; returns a line for the page that sent it.
-    fn answer(&mut self, editing: &Editing, request: &EditRequest) -> Result<Option<String>, EditingError> {
+    fn handle(&mut self, editing: &Editing, request: &EditRequest) -> Result<Option<String>, EditingError> {
         let session = &mut self.session;
         if self.before && !matches!(request, EditRequest::Compare { .. } | EditRequest::Save) {
             // A selection drawn on the scene as it was opened may not fit the edited scene.
@@ -125,9 +130,9 @@ impl Bench {
             EditRequest::Deselect => session.deselect(),
             EditRequest::Edit { gesture, whole, edit } => session.edit(gesture, whole, edit)?,
             EditRequest::Replay { list } => session.replay(&EditList::parse(&list)?)?,
-            EditRequest::Undo => session.go(session.at().saturating_sub(1))?,
-            EditRequest::Redo => session.go(session.at() + 1)?,
-            EditRequest::Go { at } => session.go(at)?,
+            EditRequest::Undo => session.go_to(session.position().saturating_sub(1))?,
+            EditRequest::Redo => session.go_to(session.position() + 1)?,
+            EditRequest::Go { at } => session.go_to(at)?,
             EditRequest::Compare { before } => self.before = before,
             EditRequest::Save => {
                 let saved = save(session, &editing.source, self.saved.as_ref())?;
@@ -140,9 +145,9 @@ impl Bench {
     }
 
     /// Writes the unsaved edits beside the scene.
-    fn keep_rest(&mut self, editing: &Editing) -> Result<(), EditingError> {
-        let kept = self.rest.keep(&self.session, &editing.source, self.saved.as_ref());
-        self.fails = kept.is_err();
+    fn write_unsaved(&mut self, editing: &Editing) -> Result<(), EditingError> {
+        let kept = self.unsaved.update(&self.session, &editing.source, self.saved.as_ref());
+        self.has_save_failed = kept.is_err();
         kept
     }
 
@@ -170,8 +175,8 @@ impl Bench {
                         .collect(),
                 )
             };
-            self.masks += 1;
-            self.mask = if selected.is_some() { self.masks } else { 0 };
+            self.last_mask += 1;
+            self.mask = if selected.is_some() { self.last_mask } else { 0 };
             let scene = is_new.then(|| Scene::of_draft(draft, self.options));
             subject.show(scene, placement, selected.as_ref().map(shown));
         }
@@ -182,12 +187,14 @@ impl Bench {
     fn to_json(&self) -> Value {
         let session = &self.session;
         let (draft, selected) = (session.draft(), session.selected());
-        let (at, total) = (session.at(), session.entries().len());
-        let first = at.saturating_sub(LISTED / 2).min(total.saturating_sub(LISTED));
+        let (at, total) = (session.position(), session.entries().len());
+        let first = at
+            .saturating_sub(MAX_LISTED_ENTRIES / 2)
+            .min(total.saturating_sub(MAX_LISTED_ENTRIES));
         let entries: Vec<Value> = session
             .entries()
             .skip(first)
-            .take(LISTED)
+            .take(MAX_LISTED_ENTRIES)
             .map(|entry| json!({ "kind": if entry.is_edit { "edit" } else { "select" }, "text": entry.text }))
             .collect();
         json!({

@@ -7,61 +7,66 @@ use glam::{DQuat, DVec4};
 use std::collections::BTreeMap;
 
 /// Number of matches beyond which the weight of a pair stays constant.
-const FULL_WEIGHT: usize = 150;
+const MAX_WEIGHTED_MATCHES: usize = 150;
 /// Maximum angle of a loop of three pairs that agree, radians: the error of two-view rotations with a guessed focal length
 /// (Zach, Klopschitz and Pollefeys, "Disambiguating visual relations using loop constraints", 2010, allow 2 to 5 degrees per pair).
-const CLOSED: f64 = 0.17;
+const MAX_LOOP_ERROR_RADIANS: f64 = 0.17;
 /// Successive scales of the robust weight, radians.
-const SCALES: [f64; 4] = [0.5, 0.25, 0.12, 0.08];
+const LOSS_SCALES_RADIANS: [f64; 4] = [0.5, 0.25, 0.12, 0.08];
 /// Sweeps over all photographs for each scale.
-const SWEEPS: usize = 40;
+const SWEEPS_PER_SCALE: usize = 40;
 /// Weight of a pair that shows a plane: two rotations fit it.
-const PLANAR: f64 = 0.2;
+const PLANAR_PAIR_WEIGHT: f64 = 0.2;
 
 /// Rotations of all photographs, estimated from pairs alone.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Turns {
+pub struct GlobalRotations {
     /// `[photos]` rotation from the camera to the world of its part; `None` without a pair.
     pub world_from_camera: Vec<Option<DQuat>>,
     /// `[photos]` the number of the connected part that each photograph is in.
-    pub part: Vec<usize>,
+    pub component: Vec<usize>,
     /// `[pairs]` angle between the rotation of each pair and the one that these rotations predict, radians.
     pub disagreement: Vec<f64>,
 }
 
-/// The rotations that agree best with those of `pairs`, where `rotations` holds the rotation from the first camera to the second of
+/// The rotations that agree best with those of `pairs`, where `measured` holds the rotation from the first camera to the second of
 /// each pair: first along the spanning tree of the best pairs, then as robust means (Hartley et al., "Rotation averaging", 2013, with
 /// Geman and McClure's weight).
-pub fn turns(photos: usize, pairs: &[VerifiedPair], rotations: &[DQuat]) -> Turns {
-    let said = rotations;
-    let closed = closed_loops(photos, pairs, said);
+pub fn average_rotations(photos: usize, pairs: &[VerifiedPair], measured: &[DQuat]) -> GlobalRotations {
+    let closed_fractions = closed_loop_fractions(photos, pairs, measured);
     let weight = |i: usize| {
-        let matches = pairs[i].matches.len().min(FULL_WEIGHT) as f64;
-        matches * (0.1 + closed[i]) * if pairs[i].kind == PairKind::Planar { PLANAR } else { 1.0 }
+        let matches = pairs[i].matches.len().min(MAX_WEIGHTED_MATCHES) as f64;
+        matches
+            * (0.1 + closed_fractions[i])
+            * if pairs[i].kind == PairKind::Planar {
+                PLANAR_PAIR_WEIGHT
+            } else {
+                1.0
+            }
     };
     let weights: Vec<f64> = (0..pairs.len()).map(weight).collect();
     let mut order: Vec<usize> = (0..pairs.len()).collect();
     // Beyond the full weight, a branch with more matches is still the better one.
-    let branch = |i: usize| weights[i] * (pairs[i].matches.len() as f64).sqrt();
-    order.sort_by(|a, b| branch(*b).total_cmp(&branch(*a)).then(a.cmp(b)));
+    let branch_weight = |i: usize| weights[i] * (pairs[i].matches.len() as f64).sqrt();
+    order.sort_by(|a, b| branch_weight(*b).total_cmp(&branch_weight(*a)).then(a.cmp(b)));
     let mut partners: Vec<Vec<(usize, DQuat, f64)>> = vec![Vec::new(); photos];
-    for ((pair, weight), b_from_a) in pairs.iter().zip(&weights).zip(said) {
+    for ((pair, weight), b_from_a) in pairs.iter().zip(&weights).zip(measured) {
         let [a, b] = pair.photos.map(|p| p as usize);
         partners[b].push((a, *b_from_a, *weight));
         partners[a].push((b, b_from_a.inverse(), *weight));
     }
-    let (mut rotations, part) = along_tree(photos, pairs, said, &order);
-    for scale in SCALES {
-        for _ in 0..SWEEPS {
+    let (mut rotations, component) = spanning_tree_rotations(photos, pairs, measured, &order);
+    for scale in LOSS_SCALES_RADIANS {
+        for _ in 0..SWEEPS_PER_SCALE {
             for photo in 0..photos {
                 let Some(own) = rotations[photo] else { continue };
                 let mut sum = DVec4::ZERO;
                 for (other, from_other, weight) in &partners[photo] {
                     let Some(other) = rotations[*other] else { continue };
-                    let said = *from_other * other;
-                    let off = angle(said, own) / scale;
-                    let robust = weight / (1.0 + off * off).powi(2);
-                    let vector = DVec4::from_array(said.to_array());
+                    let predicted = *from_other * other;
+                    let error = angle(predicted, own) / scale;
+                    let robust = weight / (1.0 + error * error).powi(2);
+                    let vector = DVec4::from_array(predicted.to_array());
                     sum += robust * vector * vector.dot(DVec4::from_array(own.to_array())).signum();
                 }
                 if let Some(mean) = sum.try_normalize() {
@@ -73,15 +78,15 @@ pub fn turns(photos: usize, pairs: &[VerifiedPair], rotations: &[DQuat]) -> Turn
     let of = |pair: &VerifiedPair| pair.photos.map(|p| rotations[p as usize].unwrap_or(DQuat::IDENTITY));
     let disagreement = pairs
         .iter()
-        .zip(said)
+        .zip(measured)
         .map(|(pair, b_from_a)| {
             let [a, b] = of(pair);
             angle(*b_from_a * a, b)
         })
         .collect();
-    Turns {
+    GlobalRotations {
         world_from_camera: rotations.into_iter().map(|r| Some(r?.inverse())).collect(),
-        part,
+        component,
         disagreement,
     }
 }
@@ -91,18 +96,18 @@ fn angle(a: DQuat, b: DQuat) -> f64 {
 }
 
 /// `[pairs]` the weighted fraction, in \[0, 1\], of the loops of three pairs through each pair that close; 0.5 without any loop.
-fn closed_loops(photos: usize, pairs: &[VerifiedPair], said: &[DQuat]) -> Vec<f64> {
-    let mut of: Vec<BTreeMap<usize, usize>> = vec![BTreeMap::new(); photos];
+fn closed_loop_fractions(photos: usize, pairs: &[VerifiedPair], measured: &[DQuat]) -> Vec<f64> {
+    let mut pairs_of: Vec<BTreeMap<usize, usize>> = vec![BTreeMap::new(); photos];
     for (i, pair) in pairs.iter().enumerate() {
         let [a, b] = pair.photos.map(|p| p as usize);
-        of[a].insert(b, i);
+        pairs_of[a].insert(b, i);
     }
     let mut counts = vec![[0.0f64; 2]; pairs.len()];
-    for (a, partners) in of.iter().enumerate() {
+    for (a, partners) in pairs_of.iter().enumerate() {
         for (b, ab) in partners {
-            for (c, bc) in &of[*b] {
-                let Some(ac) = of[a].get(c) else { continue };
-                let closes = angle(said[*bc] * said[*ab], said[*ac]) < CLOSED;
+            for (c, bc) in &pairs_of[*b] {
+                let Some(ac) = pairs_of[a].get(c) else { continue };
+                let closes = angle(measured[*bc] * measured[*ab], measured[*ac]) < MAX_LOOP_ERROR_RADIANS;
                 for (pair, others) in [(*ab, [*bc, *ac]), (*bc, [*ab, *ac]), (*ac, [*ab, *bc])] {
                     let weight = others.map(|o| pairs[o].matches.len()).into_iter().min().unwrap_or(0) as f64;
                     counts[pair][0] += if closes { weight } else { 0.0 };
@@ -118,30 +123,30 @@ fn closed_loops(photos: usize, pairs: &[VerifiedPair], said: &[DQuat]) -> Vec<f6
 }
 
 /// Rotations along the spanning tree of the first pairs of `order` that join two parts, and each photograph's part.
-fn along_tree(
+fn spanning_tree_rotations(
     photos: usize,
     pairs: &[VerifiedPair],
-    said: &[DQuat],
+    measured: &[DQuat],
     order: &[usize],
 ) -> (Vec<Option<DQuat>>, Vec<usize>) {
     let mut rotations: Vec<Option<DQuat>> = vec![None; photos];
-    let mut part: Vec<usize> = (0..photos).collect();
-    for (pair, b_from_a) in order.iter().map(|i| (&pairs[*i], said[*i])) {
+    let mut component: Vec<usize> = (0..photos).collect();
+    for (pair, b_from_a) in order.iter().map(|i| (&pairs[*i], measured[*i])) {
         let [a, b] = pair.photos.map(|p| p as usize);
-        if part[a] == part[b] {
+        if component[a] == component[b] {
             continue;
         }
         let (of_a, of_b) = (rotations[a].unwrap_or_default(), rotations[b].unwrap_or_default());
         (rotations[a], rotations[b]) = (Some(of_a), Some(of_b));
         // The part of b turns into the world of a: R_b' = R_ab R_a.
-        let turn = of_b.inverse() * b_from_a * of_a;
-        let (from, to) = (part[b], part[a]);
-        for photo in (0..photos).filter(|p| part[*p] == from) {
-            rotations[photo] = rotations[photo].map(|r| (r * turn).normalize());
+        let change = of_b.inverse() * b_from_a * of_a;
+        let (from, to) = (component[b], component[a]);
+        for photo in (0..photos).filter(|p| component[*p] == from) {
+            rotations[photo] = rotations[photo].map(|r| (r * change).normalize());
         }
-        part.iter_mut().filter(|p| **p == from).for_each(|p| *p = to);
+        component.iter_mut().filter(|p| **p == from).for_each(|p| *p = to);
     }
-    (rotations, part)
+    (rotations, component)
 }
 
 #[cfg(test)]
@@ -163,7 +168,7 @@ mod tests {
         }
     }
 
-    fn said(pairs: &[VerifiedPair]) -> Vec<DQuat> {
+    fn measured(pairs: &[VerifiedPair]) -> Vec<DQuat> {
         pairs.iter().map(|pair| pair.motion.rotation).collect()
     }
 
@@ -187,14 +192,14 @@ mod tests {
     #[test]
     fn rotations_return_and_pairs_that_agree_do_not_contradict() {
         let (cameras, pairs) = ring(24, 3);
-        let found = turns(24, &pairs, &said(&pairs));
+        let found = average_rotations(24, &pairs, &measured(&pairs));
         let first = found.world_from_camera[0].unwrap();
         for (found, truth) in found.world_from_camera.iter().zip(&cameras) {
             let relative = first.inverse() * found.unwrap();
             assert!(angle(relative, cameras[0].inverse() * *truth) < 0.04);
         }
         assert!(found.disagreement.iter().all(|off| *off < 0.1));
-        assert!(found.part.iter().all(|part| *part == found.part[0]));
+        assert!(found.component.iter().all(|component| *component == found.component[0]));
     }
 
     #[test]
@@ -208,7 +213,7 @@ mod tests {
                 pairs.push(pair(i, j, twin.inverse() * cameras[i], 60));
             }
         }
-        let found = turns(24, &pairs, &said(&pairs));
+        let found = average_rotations(24, &pairs, &measured(&pairs));
         for (i, off) in found.disagreement.iter().enumerate() {
             assert_eq!(*off > 1.0, i >= genuine, "{i} {off}");
         }
@@ -217,8 +222,8 @@ mod tests {
     #[test]
     fn photographs_without_pairs_have_no_rotation() {
         let pairs = [pair(0, 2, DQuat::from_rotation_y(0.2), 30)];
-        let found = turns(3, &pairs, &said(&pairs));
+        let found = average_rotations(3, &pairs, &measured(&pairs));
         assert!(found.world_from_camera[1].is_none() && found.world_from_camera[2].is_some());
-        assert_eq!(turns(0, &[], &[]).part, []);
+        assert_eq!(average_rotations(0, &[], &[]).component, []);
     }
 }

@@ -10,19 +10,19 @@ use rayon::prelude::*;
 use std::collections::BTreeSet;
 
 /// Maximum number of matches of a pair that are examined.
-const MATCHES: usize = 100;
+const MAX_EXAMINED_MATCHES: usize = 100;
 /// Maximum error of a match that agrees, on the plane z = 1: about eight pixels at the usual focal length.
-const AGREES: f64 = 0.01;
+const MAX_INLIER_ERROR: f64 = 0.01;
 /// A pair contradicts the model if less than this fraction of its matches agree.
-pub(super) const CONTRADICTS: f64 = 0.3;
+pub(super) const MIN_CONSISTENT_FRACTION: f64 = 0.3;
 /// Distance between two cameras, in units of the model, below which their pair only turns.
-const BASELINE: f64 = 0.003;
+const MIN_BASELINE: f64 = 0.003;
 /// Number of a photograph's strongest partners that are its neighbours: parts that only look alike share less than one part does.
-const NEIGHBOURS: usize = 3;
+const NEIGHBOUR_COUNT: usize = 3;
 /// Number of cells along the long side of a photograph; each cell with matches counts once.
-const CELLS: f32 = 16.0;
+const GRID_CELLS: f32 = 16.0;
 /// Minimum number of matches for neighbours to count as evidence.
-const TELLS: usize = 30;
+const MIN_EVIDENCE_MATCHES: usize = 30;
 
 /// `[pairs]` the fraction of the matches of each pair that agree with a model; `None` if a photograph is not in the model.
 pub fn agreement(
@@ -31,53 +31,60 @@ pub fn agreement(
     pairs: &[VerifiedPair],
     model: &Model,
 ) -> Vec<Option<f64>> {
-    let agrees = |pair: &VerifiedPair| {
+    let inlier_fraction = |pair: &VerifiedPair| {
         let [a, b] = pair.photos.map(|p| model.poses[p as usize]);
         let (a, b) = (a?, b?);
         let [camera_a, camera_b] = pair.photos.map(|p| model.cameras[photos[p as usize].group].as_ref());
         let (camera_a, camera_b) = (camera_a?, camera_b?);
-        let points = on_planes(pair, features, [camera_a, camera_b]);
+        let points = normalized_matches(pair, features, [camera_a, camera_b]);
         let rotation = b.rotation.inverse() * a.rotation;
-        let shift = b.camera_from_world(a.position);
-        if shift.length() < BASELINE {
-            let close = |[first, second]: &&[DVec2; 2]| {
-                let turned: DVec3 = rotation * first.extend(1.0);
-                turned.z > 0.0 && (turned.truncate() / turned.z - *second).length() < AGREES
+        let baseline = b.camera_from_world(a.position);
+        if baseline.length() < MIN_BASELINE {
+            let is_inlier = |[first, second]: &&[DVec2; 2]| {
+                let rotated: DVec3 = rotation * first.extend(1.0);
+                rotated.z > 0.0 && (rotated.truncate() / rotated.z - *second).length() < MAX_INLIER_ERROR
             };
-            return Some(points.iter().filter(close).count() as f64 / points.len().max(1) as f64);
+            return Some(points.iter().filter(is_inlier).count() as f64 / points.len().max(1) as f64);
         }
         let motion = Motion {
             rotation,
-            translation: shift.normalize(),
+            translation: baseline.normalize(),
         };
         let essential = motion.essential();
         let agrees = |p: &&[DVec2; 2]| {
-            sampson_squared(&essential, **p) < AGREES * AGREES
+            sampson_squared(&essential, **p) < MAX_INLIER_ERROR * MAX_INLIER_ERROR
                 // Distant points may be triangulated just behind the cameras, so only the rays are tested: both must point the same way.
                 && (rotation * p[0].extend(1.0)).dot(p[1].extend(1.0)) > 0.0
         };
         Some(points.iter().filter(agrees).count() as f64 / points.len().max(1) as f64)
     };
-    pairs.par_iter().map(agrees).collect()
+    pairs.par_iter().map(inlier_fraction).collect()
 }
 
 /// Some of the matches of a pair on the planes z = 1.
-pub(crate) fn on_planes(pair: &VerifiedPair, features: &[Features], cameras: [&DCamera; 2]) -> Vec<[DVec2; 2]> {
-    let thin = pair.matches.len().div_ceil(MATCHES).max(1);
-    let place = |side: usize, keypoint: u32| {
+pub(crate) fn normalized_matches(
+    pair: &VerifiedPair,
+    features: &[Features],
+    cameras: [&DCamera; 2],
+) -> Vec<[DVec2; 2]> {
+    let step = pair.matches.len().div_ceil(MAX_EXAMINED_MATCHES).max(1);
+    let normalized = |side: usize, keypoint: u32| {
         let features = &features[pair.photos[side] as usize];
         cameras[side].unproject(features.keypoints[keypoint as usize].at())
     };
-    let matches = pair.matches.iter().step_by(thin);
+    let matches = pair.matches.iter().step_by(step);
     matches
-        .filter_map(|[i, j]| Some([place(0, *i)?, place(1, *j)?]))
+        .filter_map(|[i, j]| Some([normalized(0, *i)?, normalized(1, *j)?]))
         .collect()
 }
 
 /// `[pairs]` the strength of each pair: the area that its matches cover, relative to that of the third-best pair of whichever of its
 /// photographs is less covered; 1 or more for neighbours. A label that occurs twice has many matches, but on a small area.
 pub fn strengths(photos: &[PhotoInfo], features: &[Features], pairs: &[VerifiedPair]) -> Vec<f64> {
-    let covered: Vec<usize> = pairs.par_iter().map(|pair| covered(photos, features, pair)).collect();
+    let covered: Vec<usize> = pairs
+        .par_iter()
+        .map(|pair| covered_cells(photos, features, pair))
+        .collect();
     let mut of_photo: Vec<Vec<usize>> = vec![Vec::new(); photos.len()];
     for (pair, covered) in pairs.iter().zip(&covered) {
         pair.photos.iter().for_each(|p| of_photo[*p as usize].push(*covered));
@@ -85,23 +92,30 @@ pub fn strengths(photos: &[PhotoInfo], features: &[Features], pairs: &[VerifiedP
     for of in &mut of_photo {
         of.sort_unstable_by_key(|covered| std::cmp::Reverse(*covered));
     }
-    let usual = |photo: u32| {
+    let neighbour_coverage = |photo: u32| {
         let of = &of_photo[photo as usize];
-        of[NEIGHBOURS.min(of.len()) - 1]
+        of[NEIGHBOUR_COUNT.min(of.len()) - 1]
     };
-    let least = |pair: &VerifiedPair| pair.photos.map(usual).into_iter().min().unwrap_or(1).max(1);
+    let reference = |pair: &VerifiedPair| {
+        pair.photos
+            .map(neighbour_coverage)
+            .into_iter()
+            .min()
+            .unwrap_or(1)
+            .max(1)
+    };
     pairs
         .iter()
         .zip(&covered)
-        .map(|(pair, covered)| *covered as f64 / least(pair) as f64)
+        .map(|(pair, covered)| *covered as f64 / reference(pair) as f64)
         .collect()
 }
 
 /// Number of cells with a match, in the photograph that has fewer of them.
-fn covered(photos: &[PhotoInfo], features: &[Features], pair: &VerifiedPair) -> usize {
+fn covered_cells(photos: &[PhotoInfo], features: &[Features], pair: &VerifiedPair) -> usize {
     let of_side = |side: usize| {
         let photo = pair.photos[side] as usize;
-        let cell = photos[photo].width.max(photos[photo].height) as f32 / CELLS;
+        let cell = photos[photo].width.max(photos[photo].height) as f32 / GRID_CELLS;
         let place = |seen: &[u32; 2]| {
             let k = features[photo].keypoints[seen[side] as usize];
             ((k.x / cell) as u32, (k.y / cell) as u32)
@@ -112,14 +126,14 @@ fn covered(photos: &[PhotoInfo], features: &[Features], pair: &VerifiedPair) -> 
 }
 
 /// Indices of the pairs of neighbours with enough matches to count as evidence.
-pub fn telling(pairs: &[VerifiedPair], strengths: &[f64]) -> impl Iterator<Item = usize> {
-    (0..pairs.len()).filter(|i| pairs[*i].matches.len() >= TELLS && strengths[*i] >= 1.0)
+pub fn evidence_pairs(pairs: &[VerifiedPair], strengths: &[f64]) -> impl Iterator<Item = usize> {
+    (0..pairs.len()).filter(|i| pairs[*i].matches.len() >= MIN_EVIDENCE_MATCHES && strengths[*i] >= 1.0)
 }
 
 /// Indices of the neighbours whose matches contradict the model, most matches first: these pairs are across a fold.
 pub fn contradictions(pairs: &[VerifiedPair], strengths: &[f64], agreement: &[Option<f64>]) -> Vec<usize> {
-    let mut found: Vec<usize> = telling(pairs, strengths)
-        .filter(|i| agreement[*i].is_some_and(|a| a < CONTRADICTS))
+    let mut found: Vec<usize> = evidence_pairs(pairs, strengths)
+        .filter(|i| agreement[*i].is_some_and(|a| a < MIN_CONSISTENT_FRACTION))
         .collect();
     found.sort_by_key(|i| (std::cmp::Reverse(pairs[*i].matches.len()), *i));
     found

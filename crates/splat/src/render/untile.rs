@@ -33,14 +33,14 @@ pub(super) enum Content {
 }
 
 /// Writes a line of an image.
-pub(super) struct DevelopLine<'a> {
+pub(super) struct UntileLine<'a> {
     pub tiles: Tiles<'a>,
     pub y: usize,
     pub content: Content,
     pub to: &'a mut [f32],
 }
 
-impl Kernel for DevelopLine<'_> {
+impl Kernel for UntileLine<'_> {
     type Output = ();
 
     #[inline(always)]
@@ -52,16 +52,16 @@ impl Kernel for DevelopLine<'_> {
         let (whole, rest) = self.to.as_chunks_mut::<BLOCK_WIDTH>();
         let end = BLOCK_WIDTH * whole.len();
         for (i, to) in whole.iter_mut().enumerate() {
-            *to = developed(tiles, self.content, y, i * BLOCK_WIDTH);
+            *to = untiled(tiles, self.content, y, i * BLOCK_WIDTH);
         }
         if !rest.is_empty() {
-            rest.copy_from_slice(&developed(tiles, self.content, y, end)[..rest.len()]);
+            rest.copy_from_slice(&untiled(tiles, self.content, y, end)[..rest.len()]);
         }
     }
 }
 
 #[inline(always)]
-fn developed(tiles: Tiles, content: Content, y: usize, x: usize) -> [f32; BLOCK_WIDTH] {
+fn untiled(tiles: Tiles, content: Content, y: usize, x: usize) -> [f32; BLOCK_WIDTH] {
     let mut to = [0.0; BLOCK_WIDTH];
     let t = tiles.run(CHANNELS - 1, y, x);
     match content {

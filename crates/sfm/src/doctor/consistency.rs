@@ -3,40 +3,40 @@
 //! A wrong two-view rotation does not prove a wrong pair: two rotations fit a plane, and with little parallax many fit. A pair
 //! therefore contradicts the rest only if no motion near the rotation that the rest predicts explains its matches.
 
-use super::{Diagnosis, Evidence, Turns, turns};
+use super::{Diagnosis, Evidence, GlobalRotations, average_rotations};
 use crate::Features;
 use crate::geometry::camera::DCamera;
 use crate::geometry::correspondences::sampson_squared;
 use crate::geometry::essential::{Motion, refine_motion};
-use crate::map::{PhotoInfo, Source, VerifiedPair, agreement, contradictions, on_planes, strengths};
+use crate::map::{FocalSource, PhotoInfo, VerifiedPair, agreement, contradictions, normalized_matches, strengths};
 use glam::{DQuat, DVec2};
 use irradia_scene::Rng;
 use rayon::prelude::*;
 
 /// Minimum disagreement with the prediction at which another motion is searched for, radians.
-const DOUBTFUL: f64 = 0.17;
+const MIN_DISAGREEMENT_RADIANS: f64 = 0.17;
 /// Maximum angle between such a motion and the prediction, radians.
-const NEAR: f64 = 0.26;
+const MAX_DEVIATION_RADIANS: f64 = 0.26;
 /// Number of translation directions that are tried.
-const TRIES: usize = 50;
+const TRANSLATION_SAMPLES: usize = 50;
 /// Errors up to which matches agree, on the plane z = 1: first coarse, for a predicted rotation a few degrees off, then finer.
-const STEPS: [f64; 3] = [0.06, 0.03, 0.012];
+const REFINEMENT_THRESHOLDS: [f64; 3] = [0.06, 0.03, 0.012];
 /// The final such error, about eight pixels at the usual focal length: the lens is still unknown.
-const AGREES: f64 = 0.01;
+const INLIER_THRESHOLD: f64 = 0.01;
 /// Minimum fraction of a pair's matches that agree with the rest.
-const EXPLAINED: f64 = 0.6;
+const MIN_INLIER_FRACTION: f64 = 0.6;
 /// Fraction of pairs without any motion near the prediction at which the prediction is rejected.
-const UNSETTLED: f64 = 0.15;
+const MAX_UNEXPLAINED_FRACTION: f64 = 0.15;
 /// Minimum number of contradicting pairs for a diagnosis.
-const PAIRS: usize = 2;
+const MIN_CONTRADICTING_PAIRS: usize = 2;
 
 /// Rotations that agree with most pairs, and how well each pair agrees with them.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Consistency {
     /// Rotations of all photographs.
-    pub turns: Turns,
+    pub rotations: GlobalRotations,
     /// `[pairs]` the fraction of the matches that are explained by some motion near the predicted rotation.
-    pub agree: Vec<f64>,
+    pub inlier_fractions: Vec<f64>,
 }
 
 /// Finds pairs that do not fit into loops with the others: averages rotations over all pairs, and searches for another motion near
@@ -44,31 +44,31 @@ pub struct Consistency {
 pub fn consistency(
     photos: &[PhotoInfo],
     features: &[Features],
-    cameras: &[(DCamera, Source)],
+    cameras: &[(DCamera, FocalSource)],
     pairs: &[VerifiedPair],
 ) -> Consistency {
-    const ROUNDS: usize = 3;
+    const MAX_ROUNDS: usize = 3;
     let mut rotations: Vec<DQuat> = pairs.iter().map(|pair| pair.motion.rotation).collect();
-    let mut settled = turns(photos.len(), pairs, &rotations);
-    let mut agree = vec![1.0; pairs.len()];
-    for _ in 0..ROUNDS {
+    let mut averaged = average_rotations(photos.len(), pairs, &rotations);
+    let mut inlier_fractions = vec![1.0; pairs.len()];
+    for _ in 0..MAX_ROUNDS {
         let found: Vec<(f64, Option<DQuat>)> = pairs
             .par_iter()
             .enumerate()
             .map(|(i, pair)| {
-                let [a, b] = pair.photos.map(|p| settled.world_from_camera[p as usize]);
+                let [a, b] = pair.photos.map(|p| averaged.world_from_camera[p as usize]);
                 let (Some(a), Some(b)) = (a, b) else { return (1.0, None) };
-                if settled.disagreement[i] < DOUBTFUL {
+                if averaged.disagreement[i] < MIN_DISAGREEMENT_RADIANS {
                     return (1.0, None);
                 }
                 let camera = |photo: u32| &cameras[photos[photo as usize].group].0;
-                let points = on_planes(pair, features, pair.photos.map(camera));
-                near_prediction(&points, b.inverse() * a, i as u64)
+                let points = normalized_matches(pair, features, pair.photos.map(camera));
+                motion_near_prediction(&points, b.inverse() * a, i as u64)
             })
             .collect();
         let mut changed = false;
         for (i, (fraction, rotation)) in found.into_iter().enumerate() {
-            agree[i] = fraction;
+            inlier_fractions[i] = fraction;
             if let Some(rotation) = rotation {
                 rotations[i] = rotation;
                 changed = true;
@@ -77,21 +77,24 @@ pub fn consistency(
         if !changed {
             break;
         }
-        settled = turns(photos.len(), pairs, &rotations);
+        averaged = average_rotations(photos.len(), pairs, &rotations);
     }
-    Consistency { turns: settled, agree }
+    Consistency {
+        rotations: averaged,
+        inlier_fractions,
+    }
 }
 
 impl Consistency {
     /// Whether most pairs agree with the rotations: with long lenses, two-view rotations are ambiguous and often wrong.
-    pub fn is_settled(&self) -> bool {
-        let off = self.agree.iter().filter(|agree| **agree < 0.5).count();
-        (off as f64) < UNSETTLED * self.agree.len() as f64
+    pub fn is_consistent(&self) -> bool {
+        let unexplained = self.inlier_fractions.iter().filter(|fraction| **fraction < 0.5).count();
+        (unexplained as f64) < MAX_UNEXPLAINED_FRACTION * self.inlier_fractions.len() as f64
     }
 }
 
 /// The fraction of the matches that agree with a motion, in front of both cameras.
-fn explained(motion: &Motion, points: &[[DVec2; 2]], threshold: f64) -> f64 {
+fn inlier_fraction(motion: &Motion, points: &[[DVec2; 2]], threshold: f64) -> f64 {
     let essential = motion.essential();
     let agrees = |p: &&[DVec2; 2]| {
         sampson_squared(&essential, **p) < threshold * threshold
@@ -103,7 +106,7 @@ fn explained(motion: &Motion, points: &[[DVec2; 2]], threshold: f64) -> f64 {
 
 /// The best motion whose rotation is near `predicted`: the fraction of matches that agree with it, and its rotation if it explains
 /// the pair.
-fn near_prediction(points: &[[DVec2; 2]], predicted: DQuat, seed: u64) -> (f64, Option<DQuat>) {
+fn motion_near_prediction(points: &[[DVec2; 2]], predicted: DQuat, seed: u64) -> (f64, Option<DQuat>) {
     if points.len() < 8 {
         return (1.0, None);
     }
@@ -111,7 +114,7 @@ fn near_prediction(points: &[[DVec2; 2]], predicted: DQuat, seed: u64) -> (f64, 
     let normal = |[a, b]: [DVec2; 2]| (predicted * a.extend(1.0)).cross(b.extend(1.0));
     let mut rng = Rng::new(seed, 7);
     let mut best: Option<(f64, Motion)> = None;
-    for _ in 0..TRIES {
+    for _ in 0..TRANSLATION_SAMPLES {
         let [i, j] = [0; 2].map(|_| rng.below(points.len() as u32) as usize);
         let Some(translation) = normal(points[i]).cross(normal(points[j])).try_normalize() else {
             continue;
@@ -120,23 +123,23 @@ fn near_prediction(points: &[[DVec2; 2]], predicted: DQuat, seed: u64) -> (f64, 
             rotation: predicted,
             translation,
         };
-        let fraction = explained(&motion, points, STEPS[1]);
-        if best.is_none_or(|(most, _)| fraction > most) {
+        let fraction = inlier_fraction(&motion, points, REFINEMENT_THRESHOLDS[1]);
+        if best.is_none_or(|(highest, _)| fraction > highest) {
             best = Some((fraction, motion));
         }
     }
     let Some((_, mut motion)) = best else {
         return (1.0, None);
     };
-    for threshold in STEPS {
+    for threshold in REFINEMENT_THRESHOLDS {
         motion = refine_motion(motion, points, threshold, 3).unwrap_or(motion);
     }
     let angle = 2.0 * motion.rotation.dot(predicted).abs().min(1.0).acos();
-    if angle > NEAR {
+    if angle > MAX_DEVIATION_RADIANS {
         return (0.0, None);
     }
-    let fraction = explained(&motion, points, AGREES);
-    (fraction, (fraction > EXPLAINED).then_some(motion.rotation))
+    let fraction = inlier_fraction(&motion, points, INLIER_THRESHOLD);
+    (fraction, (fraction > MIN_INLIER_FRACTION).then_some(motion.rotation))
 }
 
 /// Diagnoses repeated structures: neighbours that disagree with the model, unless something moves in both (`moving` lists such
@@ -150,13 +153,17 @@ pub(super) fn contradiction(evidence: &Evidence, moving: &[usize]) -> Vec<Diagno
     let strengths = strengths(evidence.photos, evidence.features, pairs);
     let mut found = contradictions(pairs, &strengths, &agreement);
     found.retain(|i| !pairs[*i].photos.iter().all(|p| moving.contains(&(*p as usize))));
-    let Some(first) = found.first().copied().filter(|_| found.len() >= PAIRS) else {
+    let Some(first) = found
+        .first()
+        .copied()
+        .filter(|_| found.len() >= MIN_CONTRADICTING_PAIRS)
+    else {
         return Vec::new();
     };
     vec![Diagnosis::Contradiction {
         pairs: found.iter().map(|i| pairs[*i].photos.map(|p| p as usize)).collect(),
         matches: pairs[first].matches.len(),
-        agree: agreement[first].unwrap_or(0.0),
-        of: agreement.iter().flatten().count(),
+        agreement: agreement[first].unwrap_or(0.0),
+        total: agreement.iter().flatten().count(),
     }]
 }

@@ -51,9 +51,10 @@ impl Draft {
 
     /// The splats without the hidden ones, as they are drawn and written.
     pub fn visible_cloud(&self) -> Cow<'_, GaussianCloud> {
-        match self.hidden.is_empty() {
-            true => Cow::Borrowed(&self.cloud),
-            false => Cow::Owned(gather(&self.cloud, &self.visible().indices())),
+        if self.hidden.is_empty() {
+            Cow::Borrowed(&self.cloud)
+        } else {
+            Cow::Owned(gather(&self.cloud, &self.visible().indices()))
         }
     }
 
@@ -83,9 +84,10 @@ impl Draft {
 /// The upper median; 0 if there are no values.
 pub(crate) fn median(mut values: Vec<f32>) -> f32 {
     let middle = values.len() / 2;
-    match values.is_empty() {
-        true => 0.0,
-        false => *values.select_nth_unstable_by(middle, f32::total_cmp).1,
+    if values.is_empty() {
+        0.0
+    } else {
+        *values.select_nth_unstable_by(middle, f32::total_cmp).1
     }
 }
 

@@ -17,15 +17,48 @@ const NEIGHBOUR_RANK: usize = 6;
 /// Maximum spacing, in units of its size, of a splat that is part of a surface.
 const MAX_SURFACE_SPACING: f32 = 2.0;
 
-/// Spacing of an isolated splat, in units of its size and in units of the scene's median spacing.
-const MIN_ISOLATED_SPACINGS: [f32; 2] = [12.0, 4.0];
-/// Ratio of the largest to the middle standard deviation of a needle, and its size relative to the distance of the nearest camera.
-const MIN_NEEDLE_RATIOS: [f32; 2] = [15.0, 0.1];
+/// Spacing of an isolated splat.
+struct IsolatedSpacing {
+    /// In units of its size.
+    sizes: f32,
+    /// In units of the scene's median spacing.
+    medians: f32,
+}
+
+const MIN_ISOLATED_SPACING: IsolatedSpacing = IsolatedSpacing {
+    sizes: 12.0,
+    medians: 4.0,
+};
+
+/// Shape of a needle.
+struct NeedleShape {
+    /// Ratio of the largest to the middle standard deviation.
+    elongation: f32,
+    /// Size relative to the distance of the nearest camera.
+    size: f32,
+}
+
+const MIN_NEEDLE_SHAPE: NeedleShape = NeedleShape {
+    elongation: 15.0,
+    size: 0.1,
+};
+
 /// Size of a huge splat, relative to the distance of the nearest camera.
 const MIN_HUGE_SIZE: f32 = 0.6;
-/// The same for a splat that is huge among smaller ones, and its size in units of spacing: the size of a background's splats is about their
-/// spacing.
-const MIN_HUGE_AMONG_SMALL: [f32; 2] = [0.35, 4.0];
+
+/// Size of a splat that is huge among smaller ones.
+struct SizeAmongSmall {
+    /// Relative to the distance of the nearest camera.
+    size: f32,
+    /// In units of its spacing: the size of a background's splats is about their spacing.
+    spacings: f32,
+}
+
+const MIN_HUGE_AMONG_SMALL: SizeAmongSmall = SizeAmongSmall {
+    size: 0.35,
+    spacings: 4.0,
+};
+
 /// Minimum score at which photographs decide.
 const SUSPICION_THRESHOLD: f32 = 0.4;
 /// Minimum score of a splat in front of what views show at which photographs are not consulted: the one photograph that the splat explains
@@ -33,10 +66,42 @@ const SUSPICION_THRESHOLD: f32 = 0.4;
 const CERTAINTY_THRESHOLD: f32 = 1.5;
 /// Spacing, in units of its size, of a floater that no view shows.
 const MIN_UNSEEN_SPACING: f32 = 6.0;
-/// Minimum values for a splat in front of what views show: the share of views that see past it, its spacing in units of its size, the
-/// product of both, its opacity, and the largest sum of its blending weights in a view as a share of the view's pixels. Fainter and
-/// smaller splats are numerous and harmless, and in a forward-facing capture of leaves they are leaves.
-const MIN_IN_FRONT_VALUES: [f32; 5] = [0.4, 2.5, 2.0, 0.05, 1e-4];
+
+/// What suggests that a splat is in front of what views show.
+struct InFrontEvidence {
+    /// Share of views that see past it.
+    share: f32,
+    /// Spacing in units of its size.
+    spacing: f32,
+    /// The product of both.
+    product: f32,
+    opacity: f32,
+    /// The largest sum of its blending weights in a view, as a share of the view's pixels.
+    weight: f32,
+}
+
+/// The minimum of each. Fainter and smaller splats are numerous and harmless, and in a forward-facing capture of leaves they are leaves.
+const MIN_IN_FRONT: InFrontEvidence = InFrontEvidence {
+    share: 0.4,
+    spacing: 2.5,
+    product: 2.0,
+    opacity: 0.05,
+    weight: 1e-4,
+};
+
+impl InFrontEvidence {
+    /// The smallest ratio to what is needed.
+    fn ratio_to(&self, needed: &Self) -> f32 {
+        let ratios = [
+            self.share / needed.share,
+            self.spacing / needed.spacing,
+            self.product / needed.product,
+            self.opacity / needed.opacity,
+            self.weight / needed.weight,
+        ];
+        ratios.into_iter().fold(f32::INFINITY, f32::min)
+    }
+}
 
 /// How strongly each reason suggests that a splat is a floater.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -98,14 +163,15 @@ pub fn floater_scores(draft: &Draft) -> Vec<FloaterScores> {
             .cameras
             .iter()
             .map(|camera| camera.pose.position.distance(mean.into()));
-        match draft.cameras.is_empty() {
-            true => 2.0 * extent,
-            false => eyes.fold(f32::INFINITY, f32::min),
+        if draft.cameras.is_empty() {
+            2.0 * extent
+        } else {
+            eyes.fold(f32::INFINITY, f32::min)
         }
     };
     let mut scores = vec![FloaterScores::default(); draft.len()];
     // Spacing in units of size.
-    let mut relative_spacing = vec![0.0f32; draft.len()];
+    let mut relative_spacings = vec![0.0f32; draft.len()];
     let geometry: Vec<(FloaterScores, f32)> = (0..indices.len())
         .into_par_iter()
         .with_min_len(256)
@@ -117,28 +183,38 @@ pub fn floater_scores(draft: &Draft) -> Vec<FloaterScores> {
             let relative_spacing = spacing / largest.max(f32::MIN_POSITIVE);
             let elongation = largest / middle.max(f32::MIN_POSITIVE);
             let scores = FloaterScores {
-                isolated: (relative_spacing / MIN_ISOLATED_SPACINGS[0])
-                    .min(spacing / median_spacing / MIN_ISOLATED_SPACINGS[1]),
-                needle: (elongation / MIN_NEEDLE_RATIOS[0]).min(largest / camera_distance / MIN_NEEDLE_RATIOS[1]),
+                isolated: (relative_spacing / MIN_ISOLATED_SPACING.sizes)
+                    .min(spacing / median_spacing / MIN_ISOLATED_SPACING.medians),
+                needle: (elongation / MIN_NEEDLE_SHAPE.elongation)
+                    .min(largest / camera_distance / MIN_NEEDLE_SHAPE.size),
                 huge: (largest / camera_distance / MIN_HUGE_SIZE).max(
-                    (largest / camera_distance / MIN_HUGE_AMONG_SMALL[0])
-                        .min(1.0 / relative_spacing / MIN_HUGE_AMONG_SMALL[1]),
+                    (largest / camera_distance / MIN_HUGE_AMONG_SMALL.size)
+                        .min(1.0 / relative_spacing / MIN_HUGE_AMONG_SMALL.spacings),
                 ),
                 ..FloaterScores::default()
             };
             (scores, relative_spacing)
         })
         .collect();
-    for (i, (found, distance)) in indices.iter().zip(geometry) {
-        (scores[*i as usize], relative_spacing[*i as usize]) = (found, distance);
+    for (i, (found, relative_spacing)) in indices.iter().zip(geometry) {
+        (scores[*i as usize], relative_spacings[*i as usize]) = (found, relative_spacing);
     }
     if !draft.cameras.is_empty() {
-        score_views(draft, &shown, &relative_spacing, &mut scores);
+        score_views(draft, &shown, &relative_spacings, &mut scores);
     }
     if let Some(photographs) = draft.photographs.as_ref().and_then(Photographs::load) {
         decide_by_photographs(draft, photographs, &shown, &mut scores);
     }
     scores
+}
+
+/// A pass in which photographs decide.
+#[derive(Clone, Copy, PartialEq)]
+enum Pass {
+    /// Splats with the shape of a floater, while no other splat can change to make room for them.
+    Shapes,
+    /// All suspects: also what those hid, without them.
+    Suspects,
 }
 
 /// Photographs decide about huge splats and needles: by shape alone, part of a plain wall or of a table's edge looks like one, and a veil
@@ -162,20 +238,22 @@ fn decide_by_photographs(
     let mut rest = Selection::of(draft.len(), |i| {
         shown.contains(i) && (!is_certain(&scores[i]) || shape(&scores[i]) >= SUSPICION_THRESHOLD)
     });
-    // First the splats with a suspicious shape, while no other splat can change to make room for them; then what they hid, without them.
-    for (least, initial) in [
-        (1.0, InitialOpacity::Hidden),
-        (SUSPICION_THRESHOLD, InitialOpacity::Trained),
-    ] {
-        let suspects = Selection::of(draft.len(), |i| {
-            rest.contains(i) && (shape(&scores[i]) >= least || least < 1.0 && other(&scores[i]) >= SUSPICION_THRESHOLD)
-        });
+    for pass in [Pass::Shapes, Pass::Suspects] {
+        let initial = match pass {
+            Pass::Shapes => InitialOpacity::Hidden,
+            Pass::Suspects => InitialOpacity::Trained,
+        };
+        let is_suspect = |scores: &FloaterScores| match pass {
+            Pass::Shapes => shape(scores) >= 1.0,
+            Pass::Suspects => shape(scores) >= SUSPICION_THRESHOLD || other(scores) >= SUSPICION_THRESHOLD,
+        };
+        let suspects = Selection::of(draft.len(), |i| rest.contains(i) && is_suspect(&scores[i]));
         for (i, is_needed) in are_needed(draft, photographs, &rest, &suspects, initial) {
             let scores = &mut scores[i as usize];
             if !is_needed {
                 *scores.strongest() = scores.score().max(1.0);
                 rest.set(i as usize, false);
-            } else if least < 1.0 {
+            } else if pass == Pass::Suspects {
                 for reason in [&mut scores.huge, &mut scores.needle, &mut scores.in_front] {
                     *reason = reason.min(SUSPICION_THRESHOLD);
                 }
@@ -185,13 +263,13 @@ fn decide_by_photographs(
 }
 
 /// Scores splats by the views: whether any sees them, and whether they are in front of what views show.
-fn score_views(draft: &Draft, shown: &Selection, relative_spacing: &[f32], scores: &mut [FloaterScores]) {
+fn score_views(draft: &Draft, shown: &Selection, relative_spacings: &[f32], scores: &mut [FloaterScores]) {
     let cloud = &draft.cloud;
     // Huge splats and needles would veil everything else.
     let is_whole = |i: usize| shown.contains(i) && scores[i].huge.max(scores[i].needle) < 1.0;
     let whole = Selection::of(draft.len(), is_whole);
     let solid = Selection::of(draft.len(), |i| {
-        whole.contains(i) && relative_spacing[i] <= MAX_SURFACE_SPACING
+        whole.contains(i) && relative_spacings[i] <= MAX_SURFACE_SPACING
     });
     let (mut all, mut surfaces) = (Observer::new(draft, &whole), Observer::new(draft, &solid));
     let mut votes = vec![Votes::default(); draft.len()];
@@ -217,22 +295,18 @@ fn score_views(draft: &Draft, shown: &Selection, relative_spacing: &[f32], score
             scores.unseen = if votes.seen {
                 0.0
             } else {
-                relative_spacing[i] / MIN_UNSEEN_SPACING
+                relative_spacings[i] / MIN_UNSEEN_SPACING
             };
             let opacity = sigmoid(cloud.opacity_logits[i]);
             let share = votes.in_front_share();
-            let found = [
+            let found = InFrontEvidence {
                 share,
-                relative_spacing[i],
-                share * relative_spacing[i],
+                spacing: relative_spacings[i],
+                product: share * relative_spacings[i],
                 opacity,
-                votes.weight,
-            ];
-            let ratios = found
-                .iter()
-                .zip(MIN_IN_FRONT_VALUES)
-                .map(|(found, needed)| found / needed);
-            scores.in_front = ratios.fold(f32::INFINITY, f32::min);
+                weight: votes.weight,
+            };
+            scores.in_front = found.ratio_to(&MIN_IN_FRONT);
         }
     }
 }

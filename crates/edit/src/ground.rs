@@ -60,9 +60,10 @@ fn sample_points(draft: &Draft) -> Vec<DVec3> {
     for (i, opacity_logit) in cloud.opacity_logits.iter().enumerate() {
         let mut sizes = cloud.log_scales[i].map(|scale| f64::from(scale).exp().min(largest));
         sizes.sort_unstable_by(f64::total_cmp);
-        sum += match draft.hidden.contains(i) {
-            true => 0.0,
-            false => f64::from(sigmoid(*opacity_logit)) * sizes[1] * sizes[2],
+        sum += if draft.hidden.contains(i) {
+            0.0
+        } else {
+            f64::from(sigmoid(*opacity_logit)) * sizes[1] * sizes[2]
         };
         sums.push(sum);
     }

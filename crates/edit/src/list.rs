@@ -354,9 +354,10 @@ impl Edit {
             Operation::Opacity { factor } => check_within("opacity factor", *factor, 0.0, 1e6),
             Operation::Merge { file } => {
                 let is_plain = !file.is_empty() && file.len() <= 4096 && !file.chars().any(char::is_control);
-                match is_plain {
-                    true => Ok(()),
-                    false => Err(EditError::value("merge file", "must be the path of a scene")),
+                if is_plain {
+                    Ok(())
+                } else {
+                    Err(EditError::value("merge file", "must be the path of a scene"))
                 }
             }
             Operation::Split { name } => {
@@ -364,12 +365,13 @@ impl Edit {
                     && name.len() <= 200
                     && !name.starts_with('.')
                     && !name.chars().any(|c| c.is_control() || "/\\:*?\"<>|".contains(c));
-                match is_plain {
-                    true => Ok(()),
-                    false => Err(EditError::value(
+                if is_plain {
+                    Ok(())
+                } else {
+                    Err(EditError::value(
                         "split name",
                         "must be the name of a file, without a folder",
-                    )),
+                    ))
                 }
             }
             Operation::Reduce { count: 0 } => Err(EditError::value("reduce count", "must be 1 or more")),
@@ -385,9 +387,10 @@ impl Edit {
 }
 
 fn check_within(name: &str, value: f64, low: f64, high: f64) -> Result<(), EditError> {
-    match (low..=high).contains(&value) {
-        true => Ok(()),
-        false => Err(EditError::value(name, format!("must be {low} to {high}"))),
+    if (low..=high).contains(&value) {
+        Ok(())
+    } else {
+        Err(EditError::value(name, format!("must be {low} to {high}")))
     }
 }
 

@@ -147,126 +147,16 @@ impl Plan {
     ) -> Result<Self, EditError> {
         edit.check()?;
         let mut edit = edit.clone();
-        let n = draft.len();
-        let selection = match (&edit.op, &edit.select) {
-            (Operation::Show {}, steps) => select_marked(draft, &draft.hidden, steps.as_deref())?,
-            (Operation::Unlock {}, steps) => select_marked(draft, &draft.locked, steps.as_deref())?,
-            (_, Some(steps)) => known.map_or_else(|| select(draft, steps), |known| Ok(known.clone()))?,
-            // Hidden and locked splats move with the whole scene.
-            (
-                Operation::Move { .. }
-                | Operation::Rotate { .. }
-                | Operation::Scale { .. }
-                | Operation::Merge { .. }
-                | Operation::Upright { .. }
-                | Operation::SetLength { .. },
-                None,
-            ) => Selection::all(n),
-            (_, None) => selectable(draft),
+        let selection = selection_of(draft, &edit, known)?;
+        let target = Target {
+            draft,
+            selection: selection.clone(),
+            is_scene: edit.select.is_none(),
         };
-        let is_scene = edit.select.is_none();
-        let of = selection.clone();
-        let transformed = |transform: Transform, selection: Selection| match is_scene {
-            _ if transform.is_identity() => Change::Nothing,
-            true => Change::TransformScene(transform),
-            false => Change::Transform(selection, transform),
-        };
-        // The origin for the whole scene, otherwise the selection's centre.
-        let pivot = |about: &mut Option<[f64; 3]>| {
-            let center = || {
-                if is_scene {
-                    DVec3::ZERO
-                } else {
-                    mean_position(draft, &selection)
-                }
-            };
-            DVec3::from(*about.get_or_insert_with(|| center().to_array()))
-        };
-        let change = match &mut edit.op {
-            Operation::Delete {} => Change::Remove(selection),
-            Operation::Keep {} => {
-                let mut rest = selection;
-                rest.add(&draft.hidden);
-                rest.add(&draft.locked);
-                rest.invert();
-                Change::Remove(rest)
-            }
-            Operation::Move { by } => transformed(Transform::translation((*by).into()), selection),
-            Operation::Rotate { axis, degrees, about } => {
-                let rotation = match *degrees % 360.0 == 0.0 {
-                    true => DQuat::IDENTITY,
-                    false => DQuat::from_axis_angle(DVec3::from(*axis).normalize(), degrees.to_radians()),
-                };
-                let transform = match rotation == DQuat::IDENTITY {
-                    true => Transform::IDENTITY,
-                    false => Transform::about(pivot(about), 1.0, rotation),
-                };
-                transformed(transform, selection)
-            }
-            Operation::Scale { factor, about } => {
-                let transform = match *factor == 1.0 {
-                    true => Transform::IDENTITY,
-                    false => Transform::about(pivot(about), *factor, DQuat::IDENTITY),
-                };
-                transformed(transform, selection)
-            }
-            Operation::Upright {
-                up,
-                ground: point,
-                axis,
-            } => {
-                if up.is_none() {
-                    let found = ground(draft).ok_or(EditError::NoCameras("upright without up"))?;
-                    *up = Some(found.up);
-                    *point = point.or(found.point);
-                }
-                transformed(upright_transform(up.unwrap_or_default(), *point, *axis), selection)
-            }
-            Operation::SetLength { from, to, length } => {
-                let factor = *length / DVec3::from(*from).distance(DVec3::from(*to));
-                if !(1e-12..=1e12).contains(&factor) {
-                    let message = "would scale the scene by more than 1e12; check from, to and length";
-                    return Err(EditError::value("set-length length", message));
-                }
-                let transform = Transform::about(DVec3::ZERO, factor, DQuat::IDENTITY);
-                transformed(transform, selection)
-            }
-            Operation::Duplicate { by } => {
-                let sources = selection.indices();
-                let mut copy = gather(&draft.cloud, &sources);
-                let all = Selection::all(copy.len());
-                transform_splats(&mut copy, &all, &Transform::translation((*by).into()));
-                Change::Append(copy, sources)
-            }
-            Operation::Merge { file } => {
-                let mut other = open(file).map_err(EditError::Source)?;
-                if !other.is_consistent() {
-                    return Err(EditError::Source(format!("{file} has columns of unequal lengths")));
-                }
-                other.bring_to_world(draft.cloud.world_from_dataset);
-                let new = vec![Provenance::NEW; other.len()];
-                Change::Append(other, new)
-            }
-            op @ Operation::Recolor { .. } => match ColorMap::of(op) {
-                map if map.is_identity() => Change::Nothing,
-                map => Change::Recolor(selection, map),
-            },
-            Operation::Opacity { factor } if *factor == 1.0 => Change::Nothing,
-            Operation::Opacity { factor } => Change::Fade(selection, *factor),
-            Operation::Reduce { count } => {
-                // In the whole scene, locked splats stay and count.
-                let stay = if is_scene { count_visible_locked(draft) } else { 0 };
-                Change::Remove(least_important(draft, selection, count.saturating_sub(stay)))
-            }
-            Operation::Hide {} => Change::Hide(selection, true),
-            Operation::Show {} => Change::Hide(selection, false),
-            Operation::Lock {} => Change::Lock(selection, true),
-            Operation::Unlock {} => Change::Lock(selection, false),
-            Operation::Split { name } => Change::Split(selection, name.clone()),
-        };
+        let change = target.change(&mut edit.op, open)?;
         let grown = match &change {
-            Change::Append(cloud, _) => n + cloud.len(),
-            _ => n,
+            Change::Append(cloud, _) => draft.len() + cloud.len(),
+            _ => draft.len(),
         };
         if grown >= Provenance::NEW as usize {
             return Err(EditError::Scene(format!(
@@ -275,7 +165,7 @@ impl Plan {
         }
         Ok(Self {
             edit,
-            selection: of,
+            selection,
             change,
         })
     }
@@ -344,6 +234,175 @@ impl Plan {
     }
 }
 
+/// The splats to which an edit applies: `known`, if its steps are known to give that.
+fn selection_of(draft: &Draft, edit: &Edit, known: Option<&Selection>) -> Result<Selection, EditError> {
+    match (&edit.op, &edit.select) {
+        (Operation::Show {}, steps) => select_marked(draft, &draft.hidden, steps.as_deref()),
+        (Operation::Unlock {}, steps) => select_marked(draft, &draft.locked, steps.as_deref()),
+        (_, Some(steps)) => known.map_or_else(|| select(draft, steps), |known| Ok(known.clone())),
+        // Hidden and locked splats move with the whole scene.
+        (
+            Operation::Move { .. }
+            | Operation::Rotate { .. }
+            | Operation::Scale { .. }
+            | Operation::Merge { .. }
+            | Operation::Upright { .. }
+            | Operation::SetLength { .. },
+            None,
+        ) => Ok(Selection::all(draft.len())),
+        (_, None) => Ok(selectable(draft)),
+    }
+}
+
+/// What an operation applies to.
+struct Target<'a> {
+    draft: &'a Draft,
+    selection: Selection,
+    /// Whether the operation applies to the whole scene, because there are no steps of a selection.
+    is_scene: bool,
+}
+
+impl Target<'_> {
+    /// What `op` does to the splats. Values that `op` does not have and that are determined automatically are filled in.
+    fn change(self, op: &mut Operation, open: OpenScene) -> Result<Change, EditError> {
+        let change = match op {
+            Operation::Delete {} => Change::Remove(self.selection),
+            Operation::Keep {} => Change::Remove(self.others()),
+            Operation::Move { by } => self.transformed(Transform::translation((*by).into())),
+            Operation::Rotate { axis, degrees, about } => {
+                let transform = self.rotation(*axis, *degrees, about);
+                self.transformed(transform)
+            }
+            Operation::Scale { factor, about } => {
+                let transform = self.scaling(*factor, about);
+                self.transformed(transform)
+            }
+            Operation::Upright { up, ground, axis } => {
+                let transform = self.upright(up, ground, *axis)?;
+                self.transformed(transform)
+            }
+            Operation::SetLength { from, to, length } => self.transformed(scaling_to_length(*from, *to, *length)?),
+            Operation::Duplicate { by } => self.duplicated(*by),
+            Operation::Merge { file } => self.merged(file, open)?,
+            Operation::Recolor { .. } => self.recolored(ColorMap::of(op)),
+            Operation::Opacity { factor } if *factor == 1.0 => Change::Nothing,
+            Operation::Opacity { factor } => Change::Fade(self.selection, *factor),
+            Operation::Reduce { count } => self.reduced(*count),
+            Operation::Hide {} => Change::Hide(self.selection, true),
+            Operation::Show {} => Change::Hide(self.selection, false),
+            Operation::Lock {} => Change::Lock(self.selection, true),
+            Operation::Unlock {} => Change::Lock(self.selection, false),
+            Operation::Split { name } => Change::Split(self.selection, name.clone()),
+        };
+        Ok(change)
+    }
+
+    fn transformed(self, transform: Transform) -> Change {
+        if transform.is_identity() {
+            Change::Nothing
+        } else if self.is_scene {
+            Change::TransformScene(transform)
+        } else {
+            Change::Transform(self.selection, transform)
+        }
+    }
+
+    fn recolored(self, map: ColorMap) -> Change {
+        if map.is_identity() {
+            Change::Nothing
+        } else {
+            Change::Recolor(self.selection, map)
+        }
+    }
+
+    fn duplicated(self, by: [f64; 3]) -> Change {
+        let sources = self.selection.indices();
+        let mut copy = gather(&self.draft.cloud, &sources);
+        let all = Selection::all(copy.len());
+        transform_splats(&mut copy, &all, &Transform::translation(by.into()));
+        Change::Append(copy, sources)
+    }
+
+    fn merged(self, file: &str, open: OpenScene) -> Result<Change, EditError> {
+        let mut other = open(file).map_err(EditError::Source)?;
+        if !other.is_consistent() {
+            return Err(EditError::Source(format!("{file} has columns of unequal lengths")));
+        }
+        other.bring_to_world(self.draft.cloud.world_from_dataset);
+        let new = vec![Provenance::NEW; other.len()];
+        Ok(Change::Append(other, new))
+    }
+
+    fn reduced(self, count: usize) -> Change {
+        // In the whole scene, locked splats stay and count.
+        let stay = if self.is_scene {
+            count_visible_locked(self.draft)
+        } else {
+            0
+        };
+        Change::Remove(least_important(self.draft, self.selection, count.saturating_sub(stay)))
+    }
+
+    /// The splats that are not selected, but neither the hidden nor the locked ones.
+    fn others(self) -> Selection {
+        let mut rest = self.selection;
+        rest.add(&self.draft.hidden);
+        rest.add(&self.draft.locked);
+        rest.invert();
+        rest
+    }
+
+    /// The rotation about a point, which is filled in unless the rotation is the identity.
+    fn rotation(&self, axis: [f64; 3], degrees: f64, about: &mut Option<[f64; 3]>) -> Transform {
+        let rotation = if degrees % 360.0 == 0.0 {
+            DQuat::IDENTITY
+        } else {
+            DQuat::from_axis_angle(DVec3::from(axis).normalize(), degrees.to_radians())
+        };
+        if rotation == DQuat::IDENTITY {
+            Transform::IDENTITY
+        } else {
+            Transform::about(self.pivot(about), 1.0, rotation)
+        }
+    }
+
+    /// The scaling about a point, which is filled in unless the factor is 1.
+    fn scaling(&self, factor: f64, about: &mut Option<[f64; 3]>) -> Transform {
+        if factor == 1.0 {
+            Transform::IDENTITY
+        } else {
+            Transform::about(self.pivot(about), factor, DQuat::IDENTITY)
+        }
+    }
+
+    /// The point `about`; if absent, it becomes the origin for the whole scene, otherwise the selection's centre.
+    fn pivot(&self, about: &mut Option<[f64; 3]>) -> DVec3 {
+        let center = || {
+            if self.is_scene {
+                DVec3::ZERO
+            } else {
+                mean_position(self.draft, &self.selection)
+            }
+        };
+        DVec3::from(*about.get_or_insert_with(|| center().to_array()))
+    }
+
+    /// The transform that makes the scene upright; if `up` is absent, it is found, and a point on the ground with it.
+    fn upright(
+        &self,
+        up: &mut Option<[f64; 3]>,
+        point: &mut Option<[f64; 3]>,
+        axis: UpAxis,
+    ) -> Result<Transform, EditError> {
+        if up.is_none() {
+            let found = ground(self.draft).ok_or(EditError::NoCameras("upright without up"))?;
+            *up = Some(found.up);
+            *point = point.or(found.point);
+        }
+        Ok(upright_transform(up.unwrap_or_default(), *point, axis))
+    }
+}
+
 /// The splats that `steps` select among `marked`; all of those if there are no steps.
 fn select_marked(
     draft: &Draft,
@@ -390,6 +449,16 @@ fn scaled_opacity_logit(opacity_logit: f32, factor: f64) -> f32 {
     logit(opacity.clamp(1e-6, 0.9999) as f32)
 }
 
+/// The scaling about the origin after which the distance from `from` to `to` is `length`.
+fn scaling_to_length(from: [f64; 3], to: [f64; 3], length: f64) -> Result<Transform, EditError> {
+    let factor = length / DVec3::from(from).distance(DVec3::from(to));
+    if !(1e-12..=1e12).contains(&factor) {
+        let message = "would scale the scene by more than 1e12; check from, to and length";
+        return Err(EditError::value("set-length length", message));
+    }
+    Ok(Transform::about(DVec3::ZERO, factor, DQuat::IDENTITY))
+}
+
 /// The transform that turns `up` to the axis and moves the ground to height 0.
 fn upright_transform(up: [f64; 3], ground: Option<[f64; 3]>, axis: UpAxis) -> Transform {
     let to = match axis {
@@ -398,9 +467,10 @@ fn upright_transform(up: [f64; 3], ground: Option<[f64; 3]>, axis: UpAxis) -> Tr
         UpAxis::PlusZ => DVec3::Z,
     };
     let up = DVec3::from(up).normalize();
-    let rotation = match (up - to).length() < 1e-12 {
-        true => DQuat::IDENTITY,
-        false => DQuat::from_rotation_arc(up, to),
+    let rotation = if (up - to).length() < 1e-12 {
+        DQuat::IDENTITY
+    } else {
+        DQuat::from_rotation_arc(up, to)
     };
     let height = ground.map_or(0.0, |ground| to.dot(rotation * DVec3::from(ground)));
     Transform {

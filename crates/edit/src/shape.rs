@@ -333,34 +333,38 @@ impl SelectStep {
 
 /// Checks that all values are numbers of a sensible magnitude.
 pub(crate) fn check_finite(name: &str, values: &[f64]) -> Result<(), EditError> {
-    match values.iter().all(|v| v.abs() <= MAX_MAGNITUDE) {
-        true => Ok(()),
-        false => Err(EditError::value(name, "must be numbers between -1e12 and 1e12")),
+    if values.iter().all(|v| v.abs() <= MAX_MAGNITUDE) {
+        Ok(())
+    } else {
+        Err(EditError::value(name, "must be numbers between -1e12 and 1e12"))
     }
 }
 
 /// Checks that a value is a positive number of a sensible magnitude.
 pub(crate) fn check_positive(name: &str, value: f64) -> Result<(), EditError> {
-    match value > 1e-12 && value <= MAX_MAGNITUDE {
-        true => Ok(()),
-        false => Err(EditError::value(name, "must be a number above 0 and at most 1e12")),
+    if value > 1e-12 && value <= MAX_MAGNITUDE {
+        Ok(())
+    } else {
+        Err(EditError::value(name, "must be a number above 0 and at most 1e12"))
     }
 }
 
 /// Checks that a vector has a direction.
 pub(crate) fn check_direction(name: &str, vector: &[f64; 3]) -> Result<(), EditError> {
     check_finite(name, vector)?;
-    match DVec3::from(*vector).length() > 1e-9 {
-        true => Ok(()),
-        false => Err(EditError::value(name, "must not be of length zero")),
+    if DVec3::from(*vector).length() > 1e-9 {
+        Ok(())
+    } else {
+        Err(EditError::value(name, "must not be of length zero"))
     }
 }
 
 fn check_rotation(name: &str, values: &[f64; 4]) -> Result<(), EditError> {
     check_finite(name, values)?;
-    match values.iter().map(|v| v * v).sum::<f64>() > 1e-18 {
-        true => Ok(()),
-        false => Err(EditError::value(name, "must not be the zero quaternion")),
+    if values.iter().map(|v| v * v).sum::<f64>() > 1e-18 {
+        Ok(())
+    } else {
+        Err(EditError::value(name, "must not be the zero quaternion"))
     }
 }
 

@@ -65,9 +65,10 @@ fn split_words(text: &str) -> Result<Vec<String>, EditError> {
     let (mut words, mut word, mut quoted) = (Vec::new(), String::new(), false);
     for c in text.chars() {
         quoted ^= c == QUOTE;
-        match c.is_whitespace() && !quoted {
-            true => words.push(std::mem::take(&mut word)),
-            false => word.push(c),
+        if c.is_whitespace() && !quoted {
+            words.push(std::mem::take(&mut word));
+        } else {
+            word.push(c);
         }
     }
     if quoted {

@@ -160,9 +160,10 @@ fn fits_dataset_coordinates(cloud: &GaussianCloud) -> bool {
         mean(i).distance(center) + f64::from(largest).exp()
     };
     let mut reaches: Vec<f64> = (0..cloud.len()).map(reach).collect();
-    let extent = match reaches.is_empty() {
-        true => 1.0,
-        false => *reaches.select_nth_unstable_by(n / 2, f64::total_cmp).1,
+    let extent = if reaches.is_empty() {
+        1.0
+    } else {
+        *reaches.select_nth_unstable_by(n / 2, f64::total_cmp).1
     };
     let units = extent / world.scale;
     let far = world.invert(center).length();

@@ -85,9 +85,12 @@ impl Observer {
     pub fn depths(&mut self, camera: &Camera) -> Depths {
         let camera = self.render(camera);
         let pixels = self.renderer.depth().iter().zip(self.renderer.alpha());
-        let mean = |(depth, alpha): (&f32, &f32)| match *alpha >= MIN_DEPTH_ALPHA {
-            true => depth / alpha,
-            false => f32::INFINITY,
+        let mean = |(depth, alpha): (&f32, &f32)| {
+            if *alpha >= MIN_DEPTH_ALPHA {
+                depth / alpha
+            } else {
+                f32::INFINITY
+            }
         };
         Depths {
             camera,

@@ -56,15 +56,15 @@ impl Pass {
         self.transmittance.clear();
     }
 
-    /// The samples of ray `r`.
-    pub fn of(&self, r: usize) -> std::ops::Range<usize> {
-        self.starts[r]..self.starts[r + 1]
+    /// The samples of a ray.
+    pub fn samples_of(&self, ray: usize) -> std::ops::Range<usize> {
+        self.starts[ray]..self.starts[ray + 1]
     }
 
     /// Colour and alpha of ray `r`, before any background.
     pub fn composite(&self, r: usize) -> ([f32; 3], f32) {
         let mut color = [0.0; 3];
-        for i in self.of(r) {
+        for i in self.samples_of(r) {
             let w = self.weights[i];
             let rgb = get3(&self.block.rgb, i);
             for c in 0..3 {
@@ -77,7 +77,7 @@ impl Pass {
     /// The sample at which the accumulated weight of ray `r` reaches a half.
     pub fn median(&self, r: usize) -> Option<usize> {
         let mut covered = 0.0;
-        self.of(r).find(|i| {
+        self.samples_of(r).find(|i| {
             covered += self.weights[*i];
             covered >= 0.5
         })
@@ -99,12 +99,12 @@ impl Pass {
         let n = self.middles.len();
         self.block.reset(n);
         for (r, ray) in rays.iter().enumerate() {
-            for i in self.of(r) {
+            for i in self.samples_of(r) {
                 set3(&mut self.block.points, i, field.space.unit(ray.at(self.middles[i])));
             }
         }
         self.lengths.resize(self.block.panels() * PANEL, 0.0);
-        level.run(Densities {
+        level.run(DensitiesAlongRays {
             net: &field.nets[net],
             parameters: &field.parameters[net],
             lengths: &self.lengths,
@@ -114,7 +114,7 @@ impl Pass {
         self.weights.resize(n, 0.0);
         self.kept.clear();
         for r in 0..rays.len() {
-            let range = self.of(r);
+            let range = self.samples_of(r);
             let (counted, transmittance) = weights(
                 &self.interval_transmittances[range.clone()],
                 &mut self.weights[range.clone()],
@@ -294,7 +294,7 @@ fn blurred(weights: &[f32]) -> Vec<f32> {
 }
 
 /// Computes densities from positions, and the transmittance of intervals of `lengths`, `[panels * 32]`.
-pub(crate) struct Densities<'a> {
+pub(crate) struct DensitiesAlongRays<'a> {
     pub net: &'a Net,
     pub parameters: &'a NetParameters<f32>,
     pub lengths: &'a [f32],
@@ -302,7 +302,7 @@ pub(crate) struct Densities<'a> {
     pub block: &'a mut Block<f32>,
 }
 
-impl Kernel for Densities<'_> {
+impl Kernel for DensitiesAlongRays<'_> {
     type Output = ();
 
     #[inline(always)]
@@ -320,13 +320,13 @@ impl Kernel for Densities<'_> {
 }
 
 /// Computes the densities of a block of arbitrary points.
-pub(crate) struct Density<'a> {
+pub(crate) struct DensitiesAtPoints<'a> {
     pub net: &'a Net,
     pub parameters: &'a NetParameters<f32>,
     pub block: &'a mut Block<f32>,
 }
 
-impl Kernel for Density<'_> {
+impl Kernel for DensitiesAtPoints<'_> {
     type Output = ();
 
     #[inline(always)]

@@ -4,7 +4,7 @@ use crate::config::Sampler;
 use crate::field::Field;
 use crate::mlp::PANEL;
 use crate::net::{Block, get3, set3};
-use crate::pass::{Colors, Density};
+use crate::pass::{Colors, DensitiesAtPoints};
 use crate::space::Outside;
 use crate::state::FieldState;
 use crate::train::STREAM_OCCUPANCY;
@@ -121,7 +121,7 @@ fn query<T: Send>(
             for (i, point) in points.iter().enumerate() {
                 set3(&mut block.points, i, *point);
             }
-            level.run(Density {
+            level.run(DensitiesAtPoints {
                 net: &field.nets[last],
                 parameters: &field.parameters[last],
                 block,

@@ -7,7 +7,7 @@
 use crate::field::Field;
 use crate::mlp::PANEL;
 use crate::net::{Block, set3};
-use crate::pass::Densities;
+use crate::pass::DensitiesAlongRays;
 use crate::render::quadrature::{TRANSMITTANCE_MIN, counted};
 use crate::sample::march::March;
 use crate::space::Ray;
@@ -87,7 +87,7 @@ impl Walks {
                 self.lengths.push(walk.lengths[i]);
             }
         }
-        level.run(Densities {
+        level.run(DensitiesAlongRays {
             net: &field.nets[0],
             parameters: &field.parameters[0],
             lengths: &self.lengths,

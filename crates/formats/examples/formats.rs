@@ -140,9 +140,10 @@ fn main() {
         let format = SplatFormat::of(&path).expect("known");
         let (write, write_cpu, write_memory) = measure(|| write_splats_with(&path, &cloud, &options).expect("written"));
         let size = splat_file_size(&path).expect("written");
-        let (read, read_cpu, read_memory) = match format.is_readable() {
-            true => measure(|| read_splats(&path).expect("read")),
-            false => (f64::NAN, f64::NAN, 0),
+        let (read, read_cpu, read_memory) = if format.is_readable() {
+            measure(|| read_splats(&path).expect("read"))
+        } else {
+            (f64::NAN, f64::NAN, 0)
         };
         let rate = |seconds: f64| {
             format!(

@@ -113,9 +113,10 @@ fn describe_dataset(dataset: &Dataset) -> Description {
     let area = |(width, height): &(u32, u32)| u64::from(*width) * u64::from(*height);
     let small = sizes.clone().min_by_key(area).unwrap_or_default();
     let large = sizes.max_by_key(area).unwrap_or_default();
-    let size = match small == large {
-        true => format!("{}x{}", small.0, small.1),
-        false => format!("{}x{} to {}x{}", small.0, small.1, large.0, large.1),
+    let size = if small == large {
+        format!("{}x{}", small.0, small.1)
+    } else {
+        format!("{}x{} to {}x{}", small.0, small.1, large.0, large.1)
     };
     let points = dataset
         .points

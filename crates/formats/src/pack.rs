@@ -16,9 +16,10 @@ pub fn gzip(bytes: &[u8]) -> Vec<u8> {
         .par_iter()
         .enumerate()
         .map(|(i, part)| {
-            let flush = match i + 1 == parts.len() {
-                true => FlushCompress::Finish,
-                false => FlushCompress::Sync,
+            let flush = if i + 1 == parts.len() {
+                FlushCompress::Finish
+            } else {
+                FlushCompress::Sync
             };
             deflate(part, flush)
         })

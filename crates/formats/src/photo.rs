@@ -92,9 +92,10 @@ impl PhotoFile {
                 ),
             ));
         }
-        let pixels = match !self.keeps_alpha && pixels.has_opaque_alpha() {
-            true => pixels.without_alpha(),
-            false => pixels,
+        let pixels = if !self.keeps_alpha && pixels.has_opaque_alpha() {
+            pixels.without_alpha()
+        } else {
+            pixels
         };
         let pixels = self.undistort_and_resize(pixels, self.part(divisor), size);
         let mut mask = self

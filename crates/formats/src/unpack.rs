@@ -51,12 +51,13 @@ fn read_exactly(reader: &mut impl Read, count: usize, kind: &str) -> Result<Vec<
     let mut bytes = Vec::with_capacity(count.min(16 << 20));
     let read = reader.take(count as u64).read_to_end(&mut bytes);
     read.map_err(|error| damaged(kind, &error))?;
-    match bytes.len() == count {
-        true => Ok(bytes),
-        false => Err(Malformed(format!(
+    if bytes.len() == count {
+        Ok(bytes)
+    } else {
+        Err(Malformed(format!(
             "its {kind} stream ends after {} of {count} bytes; the file is truncated, copy it again",
             bytes.len()
-        ))),
+        )))
     }
 }
 

@@ -39,9 +39,10 @@ impl<'a> Entry<'a> {
                 self.packed.len()
             )));
         }
-        match self.is_deflated {
-            true => inflate(self.packed, self.size).map(Cow::Owned),
-            false => Ok(Cow::Borrowed(self.packed)),
+        if self.is_deflated {
+            inflate(self.packed, self.size).map(Cow::Owned)
+        } else {
+            Ok(Cow::Borrowed(self.packed))
         }
     }
 }

@@ -5,8 +5,8 @@
 
 use irradia_compute::Level;
 use irradia_measure::{
-    CoarseLoss, Crop, DepthKind, DepthLoss, DepthSample, LossWeights, Lpips, PhotometricLoss, SmoothLoss, Smoothed,
-    Target, Truth, perceptual, psnr, ssim,
+    CoarseLoss, Crop, DepthGradient, DepthKind, DepthLoss, DepthPlanes, DepthSample, LossWeights, Lpips,
+    PhotometricLoss, SmoothLoss, Smoothed, Target, Truth, perceptual, psnr, ssim,
 };
 use irradia_scene::{Image, Rng};
 use std::hint::black_box;
@@ -89,16 +89,24 @@ fn curriculum_times(width: usize, height: usize, net: Option<&Lpips>) {
         });
         print(&format!("coarse, cells of {factor}"), time);
     }
+    let frame = DepthPlanes {
+        depth: &depth,
+        alpha: &alpha,
+    };
+    let mut gradient = DepthGradient {
+        depth: &mut v_depth,
+        alpha: &mut v_alpha,
+    };
     let mut loss = DepthLoss::default();
     let kind = DepthKind::Relative;
     let time = seconds(100, || {
-        _ = black_box(loss.evaluate(&depth, &alpha, &samples, kind, 1.0, &mut v_depth, &mut v_alpha));
+        _ = black_box(loss.evaluate(frame, &samples, kind, 1.0, &mut gradient));
     });
     print("depth, 2000 samples", time);
     let mut loss = SmoothLoss::default();
     let of = Smoothed::Disparity;
     let time = seconds(100, || {
-        _ = black_box(loss.evaluate(&depth, &alpha, &target, of, 10.0, 1.0, &mut v_depth, &mut v_alpha));
+        _ = black_box(loss.evaluate(frame, &target, of, 10.0, 1.0, &mut gradient));
     });
     print("smoothness", time);
     let Some(net) = net else { return };

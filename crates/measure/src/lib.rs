@@ -17,7 +17,7 @@ pub use loss::depth::{DepthKind, DepthLoss, DepthSample};
 pub use loss::normal::{NormalLoss, NormalSample};
 pub use loss::perceptual::{Crop, perceptual};
 pub use loss::smooth::{SmoothLoss, Smoothed};
-pub use loss::{LossValues, LossWeights, PhotometricLoss, Target, Truth};
+pub use loss::{DepthGradient, DepthPlanes, LossValues, LossWeights, PhotometricLoss, Target, Truth};
 pub use metric::{
     Affine, Evaluation, ImportedTensor, Lpips, LpipsError, LpipsNet, Networks, evaluate, psnr, psnr_masked, ssim,
     ssim_masked, to_weights_file,

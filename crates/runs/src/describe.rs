@@ -18,11 +18,13 @@ pub fn describe(path: impl AsRef<Path>) -> Result<Description, RunError> {
         let bytes = std::fs::metadata(&scene).map_or(0, |file| file.len());
         return Ok(describe_field(&read_field(&scene)?, bytes));
     }
-    let mut description =
-        irradia_formats::describe(&scene).map_err(|error| match scene.is_dir() && contains_run(&scene) {
-            true => FormatError::NoScene(scene.clone()),
-            false => error,
-        })?;
+    let mut description = irradia_formats::describe(&scene).map_err(|error| {
+        if scene.is_dir() && contains_run(&scene) {
+            FormatError::NoScene(scene.clone())
+        } else {
+            error
+        }
+    })?;
     if let Some(field) = residual_beside(&scene)? {
         let adds = format!("{RESIDUAL}, {} parameters", field.len());
         description.facts.push(("reflections", adds));

@@ -126,10 +126,7 @@ impl Editing {
             // The error lists the known extensions.
             SplatFormat::of(output)?;
         }
-        let file = match is_file {
-            true => output.to_owned(),
-            false => output.join(SCENE),
-        };
+        let file = if is_file { output.to_owned() } else { output.join(SCENE) };
         check_not_overwritten(&self.path, &file)?;
         if !is_file && output.join("run.json").exists() {
             let message = format!("{} holds a run: name another folder", output.display());
@@ -299,10 +296,11 @@ impl Editing {
         let camera = before.orbit(1, Some(size))[0];
         write_image(folder.join("before.png"), &before.render(&camera).color)?;
         let after = Scene::of_draft(&self.draft, options);
-        let camera = match self.moved.is_identity() {
-            true => camera,
+        let camera = if self.moved.is_identity() {
+            camera
+        } else {
             // The same camera, moved with the scene.
-            false => after.orbit(1, Some(size))[0],
+            after.orbit(1, Some(size))[0]
         };
         write_image(folder.join("after.png"), &after.render(&camera).color)
     }
@@ -311,9 +309,10 @@ impl Editing {
 /// The scene `file`, looked up in the current folder, then beside the scene `path`.
 fn open_scene(file: &str, path: &Path) -> Result<GaussianCloud, String> {
     let here = Path::new(file);
-    let path = match here.exists() {
-        true => scene_path(here),
-        false => scene_path(&path.with_file_name(file)),
+    let path = if here.exists() {
+        scene_path(here)
+    } else {
+        scene_path(&path.with_file_name(file))
     };
     Ok(read_splat_file(&path).map_err(|error| error.to_string())?.cloud)
 }

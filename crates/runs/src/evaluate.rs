@@ -44,6 +44,20 @@ pub fn evaluate<E: From<RunError>>(
     Ok(mean(&metrics))
 }
 
+/// PSNR of the 8-bit pixels `render [H, W, 3]` against `truth [H, W, 3]` where `mask [H, W]` is not 0, dB; equal ones get that of a single
+/// difference of one. `None` if no pixel is left.
+pub fn psnr_8_bits(render: &[u8], truth: &[u8], mask: Option<&[u8]>) -> Option<f64> {
+    let (mut sum, mut count) = (0u64, 0u64);
+    for (i, (a, b)) in render.chunks_exact(3).zip(truth.chunks_exact(3)).enumerate() {
+        if mask.is_none_or(|mask| mask[i] != 0) {
+            let squares = a.iter().zip(b).map(|(a, b)| u64::from(a.abs_diff(*b)).pow(2));
+            sum += squares.sum::<u64>();
+            count += 3;
+        }
+    }
+    (count > 0).then(|| -10.0 * (sum.max(1) as f64 / (count as f64 * 255.0 * 255.0)).log10())
+}
+
 /// Removes from `views` those whose photographs cannot be decoded, such as files that are damaged behind their headers; returns one line
 /// that names them, or `None` if all can.
 pub fn leave_out_unreadable(dataset: &Dataset, views: &mut Vec<usize>) -> Option<String> {

@@ -21,15 +21,15 @@ pub const SCENE: &str = "scene.ply";
 /// The radiance field of a run.
 pub const FIELD: &str = "field.safetensors";
 /// The residual field of a run's splats.
-pub const RESIDUAL: &str = socket::FILES[1];
+pub const RESIDUAL: &str = socket::Residual::FILE;
 /// The exposures of a run's photographs.
-pub const EXPOSURES: &str = socket::FILES[2];
+pub const EXPOSURES: &str = socket::Exposure::FILE;
 /// The appearance codes of a run's photographs.
-pub const APPEARANCE: &str = socket::FILES[4];
+pub const APPEARANCE: &str = socket::Appearance::FILE;
 /// The vignettes of a run's lenses.
-pub const VIGNETTE: &str = socket::FILES[6];
+pub const VIGNETTE: &str = socket::Vignette::FILE;
 /// The sky behind a run's splats.
-pub const SKY: &str = socket::FILES[3];
+pub const SKY: &str = socket::Sky::FILE;
 
 /// The length of a run's world unit, if it is known.
 pub const UNIT: &str = "unit.json";
@@ -55,11 +55,11 @@ const FILES: [&str; 23] = [
     "events.jsonl",
     SCENE,
     FIELD,
-    socket::FILES[0],
-    socket::FILES[1],
-    socket::FILES[2],
-    socket::FILES[4],
-    socket::FILES[5],
+    socket::PoseRefinement::FILE,
+    RESIDUAL,
+    EXPOSURES,
+    APPEARANCE,
+    socket::BilateralGrid::FILE,
     VIGNETTE,
     SKY,
     "report.json",
@@ -540,9 +540,10 @@ fn camera_records(file: &Path) -> Option<Vec<CameraRecord>> {
 
 /// The file of the cameras of `scene`.
 fn cameras_file(scene: &Path) -> PathBuf {
-    match is_moved(scene) {
-        true => own_cameras_file(scene),
-        false => scene.with_file_name("cameras.json"),
+    if is_moved(scene) {
+        own_cameras_file(scene)
+    } else {
+        scene.with_file_name("cameras.json")
     }
 }
 

@@ -2,7 +2,7 @@
 
 use crate::folder::cameras_beside;
 use crate::orbit::orbit;
-use crate::{RunError, scene_path};
+use crate::{RunError, psnr_8_bits, scene_path};
 use irradia_formats::{SplatFormat, WriteOptions, read_splats, splat_file_size, write_splats_with};
 use irradia_scene::{Camera, GaussianCloud, resize_area};
 use irradia_splat::levels::merged;
@@ -101,7 +101,7 @@ pub fn write_levels(input: &Path, output: &Path, options: &WriteOptions) -> Resu
             let [width, height] = [far.intrinsics.width, far.intrinsics.height];
             let shrunk = resize_area(full, 3, [k.width, k.height], [width, height]);
             for (sum, splats) in sums.iter_mut().zip([&last, &whole.gather(&thinned), &whole]) {
-                *sum += psnr(&picture(splats, &far), &shrunk);
+                *sum += psnr_8_bits(&picture(splats, &far), &shrunk, None).expect("a frame has pixels");
             }
         }
         let [psnr, subsample_psnr, whole_psnr] = sums.map(|sum| sum / cameras.len().max(1) as f64);
@@ -154,13 +154,6 @@ fn compared_cameras(input: &Path, cloud: &GaussianCloud, splats: &Splats) -> Vec
         }
         _ => orbit(Some(splats), None, MAX_COMPARED_VIEWS, Some(COMPARED_SIZE)),
     }
-}
-
-/// PSNR of 8-bit images, dB; equal images get that of a single difference of one.
-fn psnr(a: &[u8], b: &[u8]) -> f64 {
-    let squares = a.iter().zip(b).map(|(a, b)| u64::from(a.abs_diff(*b)).pow(2));
-    let sum = squares.sum::<u64>().max(1) as f64;
-    10.0 * (255.0 * 255.0 * a.len() as f64 / sum).log10()
 }
 
 #[cfg(test)]

@@ -1,7 +1,7 @@
 //! Reduced photographs of a run, for the search for floaters.
 
 use crate::folder::{camera_names_beside, is_moved};
-use crate::scene_file::render_knobs_beside;
+use crate::scene_file::render_settings_beside;
 use crate::{RunFolder, TrainInput};
 use irradia_edit::{LoadedPhotographs, Photographs};
 use irradia_scene::Photo;
@@ -28,7 +28,7 @@ fn read(scene: &Path) -> Option<LoadedPhotographs> {
     if dataset.views.iter().any(|view| !view.camera.is_pinhole()) {
         return None;
     }
-    let background = render_knobs_beside(scene).background;
+    let background = render_settings_beside(scene).background;
     let names = camera_names_beside(scene)?;
     let step = names.len().div_ceil(MAX_PHOTOS).max(1);
     let photos: Option<Vec<(usize, Photo)>> = (0..names.len())

@@ -91,27 +91,6 @@ impl Reading {
         })
     }
 
-    /// These settings over those of a run: where they are the defaults, those of `run` apply. [`ReadingOptions::with_fallback`] tells
-    /// defaults that were given from settings that were not.
-    pub fn with_fallback(&self, run: Self) -> Self {
-        let default = Self::default();
-        let is_scaled = self.downscale != default.downscale || self.max_side != default.max_side;
-        let size = if is_scaled { self } else { &run };
-        Self {
-            downscale: size.downscale,
-            max_side: size.max_side,
-            format: self.format.clone().or(run.format),
-            holdout: self.holdout.clone().or(run.holdout),
-            images: self.images.clone().or(run.images),
-            lenses: if self.lenses == default.lenses {
-                run.lenses
-            } else {
-                self.lenses
-            },
-            readout: self.readout.clone().or(run.readout),
-        }
-    }
-
     fn holdout(&self) -> Result<Holdout, RunError> {
         let Some(text) = &self.holdout else {
             return Ok(Holdout::AsDeclared);
@@ -176,9 +155,10 @@ impl ReadingOptions {
     /// These settings, and those of `reading` where they are absent. Any of the three that set the size replaces the size of `reading`.
     pub fn with_fallback(&self, reading: Reading) -> Reading {
         let is_sized = self.downscale.is_some() || self.max_side.is_some() || self.full_size;
-        let (downscale, max_side) = match is_sized {
-            true => (self.downscale.unwrap_or(1.0), self.max_side),
-            false => (reading.downscale, reading.max_side),
+        let (downscale, max_side) = if is_sized {
+            (self.downscale.unwrap_or(1.0), self.max_side)
+        } else {
+            (reading.downscale, reading.max_side)
         };
         Reading {
             format: self.format.clone().or(reading.format),

@@ -296,9 +296,10 @@ impl TrainRequest {
             let names = larger.views.iter().map(|view| &view.name);
             names.eq(dataset.views.iter().map(|view| &view.name))
         };
-        let larger = match larger == self.reading {
-            true => None,
-            false => read_dataset(&self.input.data, &larger).ok().filter(same_views),
+        let larger = if larger == self.reading {
+            None
+        } else {
+            read_dataset(&self.input.data, &larger).ok().filter(same_views)
         };
         let message = match find_points(&mut dataset, larger.as_ref()) {
             Some(points) => format!("the dataset has no points: {points} were found by matching its photographs"),

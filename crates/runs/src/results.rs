@@ -170,9 +170,10 @@ fn device(trainer: &Trainer) -> String {
         Level::detect().name()
     );
     let device = &trainer.options.device;
-    match device.is_cpu() {
-        true => cpu,
-        false => format!("{device}; {cpu}"),
+    if device.is_cpu() {
+        cpu
+    } else {
+        format!("{device}; {cpu}")
     }
 }
 

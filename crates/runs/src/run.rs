@@ -14,7 +14,7 @@ use irradia_train::event::Observer;
 use irradia_train::memory::default_limit;
 use irradia_train::paces::Paces;
 use irradia_train::report::Report;
-use irradia_train::{RunLimits, TrainOptions, Trainer, checkpoint};
+use irradia_train::{EndReason, RunLimits, TrainOptions, Trainer, checkpoint};
 use std::fs;
 use std::path::Path;
 use std::sync::Arc;
@@ -231,7 +231,7 @@ impl Run {
     ///
     /// # Errors
     /// When a photograph cannot be read; completed steps are still saved.
-    pub fn train(&mut self, observers: &mut [&mut dyn Observer]) -> Result<String, RunError> {
+    pub fn train(&mut self, observers: &mut [&mut dyn Observer]) -> Result<EndReason, RunError> {
         let started = self.request.started;
         self.preparing.get_or_insert_with(|| started.elapsed().as_secs_f64());
         let limits = RunLimits {

@@ -10,7 +10,7 @@ use irradia_scene::{Camera, Dataset, Similarity};
 use irradia_splat::{RenderOptions, Renderer, Splats};
 use irradia_train::lights::Lights;
 use irradia_train::model::{Frame, Model};
-use irradia_train::recipe::RenderKnobs;
+use irradia_train::recipe::RenderSettings;
 use irradia_train::socket::{Vignette, background_of_sky};
 use irradia_train::{Recipe, TrainError, field_file};
 use std::borrow::Cow;
@@ -61,12 +61,12 @@ impl Scene {
     pub fn read(path: impl AsRef<Path>) -> Result<Self, RunError> {
         let path = &scene_path(path.as_ref());
         let (model, antialiased, world_from_dataset, notes) = read_model(path)?;
-        let knobs = render_knobs_beside(path);
+        let settings = render_settings_beside(path);
         Ok(Self {
             model,
             options: RenderOptions {
-                background: sky_beside(path)?.unwrap_or(knobs.background),
-                antialias: knobs.antialias || antialiased,
+                background: sky_beside(path)?.unwrap_or(settings.background),
+                antialias: settings.antialias || antialiased,
                 ..RenderOptions::default()
             },
             cameras: cameras_beside(path, &world_from_dataset).map(Into::into),
@@ -125,12 +125,13 @@ pub fn check_not_overwritten(scene: &Path, output: &Path) -> Result<(), RunError
     let scene = scene_path(scene);
     // A folder of SOG images is written as its list.
     let list = output.join(SplatFormat::SogFolder.suffix());
-    match same_file(output, &scene) || same_file(&list, &scene) {
-        true => Err(RunError::Refused(format!(
+    if same_file(output, &scene) || same_file(&list, &scene) {
+        Err(RunError::Refused(format!(
             "{} would be replaced: name another output",
             scene.display()
-        ))),
-        false => Ok(()),
+        )))
+    } else {
+        Ok(())
     }
 }
 
@@ -249,8 +250,8 @@ fn sky_beside(scene: &Path) -> Result<Option<[f32; 3]>, RunError> {
 }
 
 /// Background and antialiasing of the run that contains `scene`; the defaults if there is no run.
-pub(crate) fn render_knobs_beside(scene: &Path) -> RenderKnobs {
-    let fallback = RenderKnobs {
+pub(crate) fn render_settings_beside(scene: &Path) -> RenderSettings {
+    let fallback = RenderSettings {
         background: [0.0; 3],
         antialias: false,
         smoothing_filter: false,

@@ -14,7 +14,7 @@ use crate::folder::to_json;
 use glam::{Mat4, Vec3};
 use irradia_formats::{write_atomic, write_png, write_png_16, write_points_ply};
 use irradia_scene::{Camera, Lens, PointCloud};
-use irradia_synth::{Capture, Part, SceneName, SynthFrame, SynthOptions};
+use irradia_synth::{Capture, SceneName, Split, SynthFrame, SynthOptions};
 use serde_json::{Value, json};
 use std::path::Path;
 use std::{fmt, fs};
@@ -68,9 +68,9 @@ pub fn write_synth_dataset(out: impl AsRef<Path>, options: &SynthOptions) -> Res
     };
     let mut points = PointCloud::default();
     let mut frames: [Vec<Value>; 3] = Default::default();
-    for part in Part::ALL {
+    for split in Split::ALL {
         for folder in ["", "depth", "normal"] {
-            let folder = out.join(folder).join(part.name());
+            let folder = out.join(folder).join(split.name());
             fs::create_dir_all(&folder).map_err(RunError::io("create", &folder))?;
         }
     }
@@ -91,13 +91,13 @@ pub fn write_synth_dataset(out: impl AsRef<Path>, options: &SynthOptions) -> Res
             entry["camera_linear_velocity"] = json!(velocity(shutter.translation));
             entry["camera_angular_velocity"] = json!(velocity(shutter.rotation));
         }
-        frames[shot.part as usize].push(entry);
+        frames[shot.split as usize].push(entry);
     }
     write_points_ply(&out.join("points.ply"), &points)?;
-    let [train, val, test] = [0, 1, 2].map(|part| frames[part].len() as u32);
-    for (part, frames) in Part::ALL.into_iter().zip(frames) {
-        let mut shots = capture.shots().iter().filter(|shot| shot.part == part);
-        let k = shots.next().expect("every part has views").camera.intrinsics;
+    let [train, val, test] = [0, 1, 2].map(|split| frames[split].len() as u32);
+    for (split, frames) in Split::ALL.into_iter().zip(frames) {
+        let mut shots = capture.shots().iter().filter(|shot| shot.split == split);
+        let k = shots.next().expect("every split has views").camera.intrinsics;
         let mut transforms = json!({
             "w": k.width,
             "h": k.height,
@@ -116,10 +116,10 @@ pub fn write_synth_dataset(out: impl AsRef<Path>, options: &SynthOptions) -> Res
             Lens::Equirectangular => transforms["camera_model"] = json!("EQUIRECTANGULAR"),
             _ => transforms["camera_angle_x"] = json!(capture.fov_x()),
         }
-        if part == Part::Train {
+        if split == Split::Train {
             transforms["ply_file_path"] = json!("points.ply");
         }
-        let path = out.join(format!("transforms_{}.json", part.name()));
+        let path = out.join(format!("transforms_{}.json", split.name()));
         write_atomic(&path, |file| file.write_all(&to_json(&transforms)))?;
     }
     Ok(SynthSummary {

@@ -10,9 +10,10 @@ pub fn encode(bytes: &[u8]) -> String {
         word[1..1 + three.len()].copy_from_slice(three);
         let bits = u32::from_be_bytes(word);
         for place in 0..4 {
-            text.push(match place <= three.len() {
-                true => char::from(ALPHABET[(bits >> (18 - 6 * place) & 63) as usize]),
-                false => '=',
+            text.push(if place <= three.len() {
+                char::from(ALPHABET[(bits >> (18 - 6 * place) & 63) as usize])
+            } else {
+                '='
             });
         }
     }

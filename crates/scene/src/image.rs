@@ -47,13 +47,6 @@ impl Image {
         &self.data[at..at + c]
     }
 
-    /// Mutable access to the channels of the pixel in column `x`, row `y`.
-    pub fn pixel_mut(&mut self, x: u32, y: u32) -> &mut [f32] {
-        let c = self.channels as usize;
-        let at = (y as usize * self.width as usize + x as usize) * c;
-        &mut self.data[at..at + c]
-    }
-
     /// Values clamped to \[0, 1\] and rounded to 8 bits, `[H, W, C]`.
     pub fn to_u8(&self) -> Vec<u8> {
         self.data

@@ -159,9 +159,10 @@ impl Backdrop {
         for _ in 0..pixels {
             let neighbours = |at: usize| adjacent(self.width, mask.len(), at);
             let all = 0..mask.len();
-            mask = match dilates {
-                true => all.map(|at| mask[at] || neighbours(at).any(|to| mask[to])).collect(),
-                false => all.map(|at| mask[at] && neighbours(at).all(|to| mask[to])).collect(),
+            mask = if dilates {
+                all.map(|at| mask[at] || neighbours(at).any(|to| mask[to])).collect()
+            } else {
+                all.map(|at| mask[at] && neighbours(at).all(|to| mask[to])).collect()
             };
         }
         mask

@@ -327,9 +327,10 @@ fn majority_filter(width: usize, labels: &mut [Label]) {
     for (at, label) in labels.iter_mut().enumerate() {
         let (mut same, mut other) = (1, 0);
         for to in adjacent(width, before.len(), at) {
-            match before[to] == *label {
-                true => same += 1,
-                false => other += 1,
+            if before[to] == *label {
+                same += 1;
+            } else {
+                other += 1;
             }
         }
         if other > same {

@@ -6,7 +6,7 @@ use glam::{DVec2, DVec3};
 use irradia_scene::Rng;
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::geometry::pose::DPose;
-use irradia_sfm::map::{FocalSource, MapOptions, PhotoInfo, verify};
+use irradia_sfm::map::{FocalSource, GroupCamera, MapOptions, PhotoInfo, verify};
 use world::{CAMERA, World, around, look};
 
 #[test]
@@ -122,7 +122,7 @@ fn the_pairs_tell_the_focal_length_of_narrow_and_of_very_wide_views() {
         let world = World::of_points(camera, poses.collect(), &points, 0, 0.5, 0.1, 4);
         let options = MapOptions::default();
         let (cameras, _) = verify(&world.photos, &world.features, &world.pairs, &options, &mut |_| ());
-        let (found, source) = cameras[0];
+        let GroupCamera { camera: found, source } = cameras[0];
         assert_eq!(source, FocalSource::Pairs, "{by_side}");
         assert!(
             (found.focal() / focal - 1.0).abs() < 0.1,

@@ -428,11 +428,6 @@ impl Engine {
         &self.gradients
     }
 
-    /// The splats' gradients of the last backward pass: for a socket that moved the splats, to propagate further back.
-    pub fn gradients_mut(&mut self) -> &mut SplatGradients {
-        &mut self.gradients
-    }
-
     /// The surfaces whose added colour has a gradient, with that gradient, in ascending order of splats. Occluded surfaces, most of
     /// those in view, have none.
     pub fn color_gradients(&self) -> (Vec<Surface>, Vec<[f32; 3]>) {

@@ -56,9 +56,9 @@ pub(crate) const DEMO: Rig = Rig {
     fov_x: 0.84,
 };
 
-/// The part of the dataset that a view belongs to.
+/// The split of the dataset to which a view belongs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Part {
+pub enum Split {
     /// Training.
     Train,
     /// Validation.
@@ -67,27 +67,27 @@ pub enum Part {
     Test,
 }
 
-impl Part {
-    /// All parts, in the order of tracing.
-    pub const ALL: [Part; 3] = [Part::Train, Part::Val, Part::Test];
+impl Split {
+    /// All splits, in the order of tracing.
+    pub const ALL: [Split; 3] = [Split::Train, Split::Val, Split::Test];
 
     /// Name used in file names.
     pub fn name(self) -> &'static str {
         match self {
-            Part::Train => "train",
-            Part::Val => "val",
-            Part::Test => "test",
+            Split::Train => "train",
+            Split::Val => "val",
+            Split::Test => "test",
         }
     }
 }
 
-/// Places `count` cameras. Those of [`Part::Val`] and [`Part::Test`] are well within the span of [`Part::Train`], and between its
+/// Places `count` cameras. Those of [`Split::Val`] and [`Split::Test`] are well within the span of [`Split::Train`], and between its
 /// azimuths.
-pub fn cameras(rig: &Rig, part: Part, count: u32, width: u32, height: u32, seed: u64) -> Vec<Camera> {
-    let (stream, inset, turn) = match part {
-        Part::Train => (0, 0.0, 0.0),
-        Part::Val => (1, 0.2, 0.3),
-        Part::Test => (2, 0.2, 0.7),
+pub fn cameras(rig: &Rig, split: Split, count: u32, width: u32, height: u32, seed: u64) -> Vec<Camera> {
+    let (stream, inset, turn) = match split {
+        Split::Train => (0, 0.0, 0.0),
+        Split::Val => (1, 0.2, 0.3),
+        Split::Test => (2, 0.2, 0.7),
     };
     let mut rng = Rng::new(seed, stream);
     (0..count)
@@ -138,9 +138,9 @@ pub fn cameras(rig: &Rig, part: Part, count: u32, width: u32, height: u32, seed:
 mod tests {
     use super::*;
 
-    fn spans(part: Part, count: u32) -> ([f32; 2], [f32; 2]) {
+    fn spans(split: Split, count: u32) -> ([f32; 2], [f32; 2]) {
         let mut spans = ([f32::MAX, f32::MIN], [f32::MAX, f32::MIN]);
-        for camera in cameras(&DEMO, part, count, 64, 64, 0) {
+        for camera in cameras(&DEMO, split, count, 64, 64, 0) {
             let away = camera.pose.position - Vec3::new(0.0, 0.0, 0.36);
             let widen = |span: &mut [f32; 2], v: f32| *span = [span[0].min(v), span[1].max(v)];
             widen(&mut spans.0, away.length());
@@ -151,9 +151,9 @@ mod tests {
 
     #[test]
     fn held_out_cameras_are_within_the_span_of_the_training_cameras() {
-        let (distance, elevation) = spans(Part::Train, 40);
-        for part in [Part::Val, Part::Test] {
-            let (d, e) = spans(part, 5);
+        let (distance, elevation) = spans(Split::Train, 40);
+        for split in [Split::Val, Split::Test] {
+            let (d, e) = spans(split, 5);
             assert!(d[0] > distance[0] && d[1] < distance[1]);
             assert!(e[0] > elevation[0] && e[1] < elevation[1]);
         }
@@ -162,7 +162,7 @@ mod tests {
     #[test]
     fn no_surface_is_close_to_a_camera() {
         let scene = crate::demo_scene();
-        for camera in cameras(&DEMO, Part::Train, 40, 8, 8, 3) {
+        for camera in cameras(&DEMO, Split::Train, 40, 8, 8, 3) {
             let frame = scene.trace(&camera, 1, 0);
             assert!(frame.depth.data.iter().all(|depth| *depth > 0.5));
         }

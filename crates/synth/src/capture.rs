@@ -1,6 +1,6 @@
 //! The views of a scene: cameras, frames, and points such as structure from motion produces.
 
-use crate::cameras::{Part, cameras};
+use crate::cameras::{Split, cameras};
 use crate::lens::SynthLens;
 use crate::scene::SynthScene;
 use crate::scenes::SceneName;
@@ -78,9 +78,9 @@ pub enum SynthError {
 /// A view to trace.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Shot {
-    /// Part of the dataset.
-    pub part: Part,
-    /// Index among the views of its part.
+    /// The split of the dataset to which it belongs.
+    pub split: Split,
+    /// Index among the views of its split.
     pub number: u32,
     /// The camera.
     pub camera: Camera,
@@ -91,7 +91,7 @@ pub struct Shot {
 impl Shot {
     /// Name without extension, such as `train/r_007`.
     pub fn name(&self) -> String {
-        format!("{}/r_{:03}", self.part.name(), self.number)
+        format!("{}/r_{:03}", self.split.name(), self.number)
     }
 }
 
@@ -130,20 +130,20 @@ impl Capture {
         }
         let (scene, rig) = scene.build(seed);
         let mut shots: Vec<Shot> = Vec::new();
-        for part in Part::ALL {
-            let cameras = cameras(&rig, part, Self::count(views, part), width, height, seed);
+        for split in Split::ALL {
+            let cameras = cameras(&rig, split, Self::count(views, split), width, height, seed);
             for (number, mut camera) in (0..).zip(cameras) {
                 let wide = lens.intrinsics(camera.intrinsics);
-                camera.intrinsics = match part {
-                    Part::Train | Part::Val => wide,
-                    Part::Test => camera.intrinsics.scaled(wide.fx / camera.intrinsics.fx),
+                camera.intrinsics = match split {
+                    Split::Train | Split::Val => wide,
+                    Split::Test => camera.intrinsics.scaled(wide.fx / camera.intrinsics.fx),
                 };
-                if turn > 0.0 && part != Part::Test {
+                if turn > 0.0 && split != Split::Test {
                     camera.shutter = Some(moving(turn, &mut Rng::new(seed, 2000 + shots.len() as u64)));
                 }
                 let seed = seed.wrapping_mul(1_000_003).wrapping_add(shots.len() as u64);
                 shots.push(Shot {
-                    part,
+                    split,
                     number,
                     camera,
                     seed,
@@ -158,11 +158,11 @@ impl Capture {
         })
     }
 
-    fn count(views: u32, part: Part) -> u32 {
-        match part {
-            Part::Train => views,
-            Part::Val => (views / 20).max(1),
-            Part::Test => (views / 8).max(2),
+    fn count(views: u32, split: Split) -> u32 {
+        match split {
+            Split::Train => views,
+            Split::Val => (views / 20).max(1),
+            Split::Test => (views / 8).max(2),
         }
     }
 
@@ -176,7 +176,7 @@ impl Capture {
         self.fov_x
     }
 
-    /// All views, part by part: training, validation, held out.
+    /// All views, split by split: training, validation, held out.
     pub fn shots(&self) -> &[Shot] {
         &self.shots
     }
@@ -190,7 +190,7 @@ impl Capture {
     /// whose points are spread evenly, only places with contrast have points, and the sky has none.
     pub fn points(&self, shot: &Shot, frame: &SynthFrame) -> PointCloud {
         let mut points = PointCloud::default();
-        if shot.part == Part::Train {
+        if shot.split == Split::Train {
             let count = (POINT_COUNT / self.options.views).max(1);
             let mut rng = Rng::new(self.options.seed, 1000 + u64::from(shot.number));
             for _ in 0..count {
@@ -232,7 +232,7 @@ pub fn dataset(options: &SynthOptions) -> Result<Dataset, SynthError> {
         ..Dataset::default()
     };
     let mut points = PointCloud::default();
-    for shot in capture.shots().iter().filter(|shot| shot.part != Part::Val) {
+    for shot in capture.shots().iter().filter(|shot| shot.split != Split::Val) {
         let frame = capture.trace(shot);
         let found = capture.points(shot, &frame);
         points.positions.extend(found.positions);
@@ -249,7 +249,7 @@ pub fn dataset(options: &SynthOptions) -> Result<Dataset, SynthError> {
             .push(View::new(format!("{}.png", shot.name()), shot.camera, Arc::new(photo)));
     }
     dataset.views.sort_by(|a, b| a.name.cmp(&b.name));
-    let held_out = format!("{}/", Part::Test.name());
+    let held_out = format!("{}/", Split::Test.name());
     (dataset.test, dataset.train) =
         (0..dataset.views.len()).partition(|i| dataset.views[*i].name.starts_with(&held_out));
     dataset.points = Some(points);

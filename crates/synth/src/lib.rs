@@ -31,7 +31,7 @@ mod sky;
 mod texture;
 mod trace;
 
-pub use cameras::{Part, Path, Rig};
+pub use cameras::{Path, Rig, Split};
 pub use capture::{Capture, Shot, SynthError, SynthOptions, dataset};
 pub use lens::{SynthLens, UnknownLens};
 pub use scene::{Cluster, Hit, Light, Material, Object, SynthScene, demo_scene};

@@ -24,6 +24,7 @@ use rayon::prelude::*;
 use safetensors::tensor::{Dtype, Metadata, SafeTensors, TensorInfo};
 use std::borrow::Cow;
 use std::collections::HashMap;
+use std::fmt::Display;
 use std::io::{self, Write};
 use std::sync::Arc;
 
@@ -186,7 +187,7 @@ fn write_tensors(
             Content::Bytes(bytes) => out.write_all(bytes)?,
             Content::Planes(planes) => {
                 for c in 0..planes.count() {
-                    for piece in planes.plane(c)[..planes.len()].chunks(VALUES_PER_WRITE) {
+                    for piece in planes.plane(c)[..planes.len()].chunks(VALUES_PER_CHUNK) {
                         encoded.resize(4 * piece.len(), 0);
                         for (to, value) in encoded.as_chunks_mut().0.iter_mut().zip(piece) {
                             *to = value.to_le_bytes();
@@ -200,26 +201,47 @@ fn write_tensors(
     Ok(())
 }
 
+/// The error of a checkpoint that cannot be read, for the reason `why`.
+fn damaged(why: impl Display) -> TrainError {
+    TrainError::Checkpoint(format!("the checkpoint is damaged: {why}"))
+}
+
 /// A column of a checkpoint.
-fn planes_of(file: &SafeTensors, name: &str) -> Result<Planes, String> {
-    let view = file.tensor(name).map_err(|e| e.to_string())?;
-    if view.dtype() != Dtype::F32 {
-        return Err(format!("{name} is not {:?}", Dtype::F32));
-    }
+fn read_planes(tensors: TensorSource, name: &str) -> Result<Planes, String> {
+    let view = tensors.view(name, Dtype::F32)?;
     let [count, len] = view.shape()[..] else {
         return Err(format!("{name} has {} dimensions", view.shape().len()));
     };
     let mut planes = Planes::zeros(count, len);
     for c in 0..count {
         let from = view.data()[4 * c * len..4 * (c + 1) * len].as_chunks().0;
-        let to = planes.plane_mut(c)[..len].par_iter_mut().with_min_len(VALUES_PER_WRITE);
+        let to = planes.plane_mut(c)[..len].par_iter_mut().with_min_len(VALUES_PER_CHUNK);
         to.zip(from).for_each(|(to, from)| *to = f32::from_le_bytes(*from));
     }
     Ok(planes)
 }
 
+/// The columns of `owner`, one of [`COLUMN_OWNERS`].
+fn read_columns(tensors: TensorSource, owner: &str) -> Result<Splats, String> {
+    let mut splats = Splats::default();
+    for (name, planes) in COLUMN_NAMES.iter().zip(splats.columns_mut()) {
+        *planes = read_planes(tensors, &format!("{owner}.{name}"))?;
+    }
+    Ok(splats)
+}
+
+/// Numbers of components and lengths of the columns.
+fn column_shapes(splats: &Splats) -> [(usize, usize); COLUMN_NAMES.len()] {
+    splats.columns().map(|planes| (planes.count(), planes.len()))
+}
+
+/// Whether all columns of `splats` have the same length, and the number of components for their SH bands.
+fn has_consistent_columns(splats: &Splats) -> bool {
+    column_shapes(splats) == column_shapes(&Splats::zeros(splats.len(), splats.sh_degree()))
+}
+
 /// Number of values that are encoded at a time, so that they are still in the cache when they are written.
-const VALUES_PER_WRITE: usize = 1 << 16;
+const VALUES_PER_CHUNK: usize = 1 << 16;
 
 /// A tensor of the file.
 struct Tensor<'a> {
@@ -288,47 +310,70 @@ pub fn recipe_of(bytes: &[u8]) -> Result<(Recipe, u64), TrainError> {
 /// # Errors
 /// When the bytes are not a complete checkpoint.
 pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) -> Result<Trainer, TrainError> {
-    let wrong = |why: String| TrainError::Checkpoint(format!("the checkpoint is damaged: {why}"));
     let (recipe, seed) = recipe_of(bytes)?;
-    let file = SafeTensors::deserialize(bytes).map_err(|e| wrong(e.to_string()))?;
-    let array = |name: &str, dtype: Dtype| -> Result<(Vec<usize>, &[u8]), TrainError> {
-        let view = file.tensor(name).map_err(|e| wrong(e.to_string()))?;
-        if view.dtype() != dtype {
-            return Err(wrong(format!("{name} is not {dtype:?}")));
-        }
-        Ok((view.shape().to_vec(), view.data()))
-    };
-    let planes = |name: &str| planes_of(&file, name).map_err(wrong);
-    let splats = |owner: &str| -> Result<Splats, TrainError> {
-        Ok(Splats {
-            means: planes(&format!("{owner}.means"))?,
-            quats: planes(&format!("{owner}.quats"))?,
-            log_scales: planes(&format!("{owner}.log_scales"))?,
-            opacity_logits: planes(&format!("{owner}.opacity_logits"))?,
-            sh: planes(&format!("{owner}.sh"))?,
-        })
-    };
-    let state = SplatState {
-        splats: splats(COLUMN_OWNERS[0])?,
-        moments: [splats(COLUMN_OWNERS[1])?, splats(COLUMN_OWNERS[2])?],
-        statistics: planes("statistics")?,
-        filter: planes("filter")?,
-    };
-    let like = |s: &Splats| s.columns().map(|c| (c.count(), c.len()));
-    let shape = like(&state.splats);
-    let expected = like(&Splats::zeros(state.splats.len(), state.splats.sh_degree()));
-    if state.moments.iter().any(|m| like(m) != shape)
-        || shape != expected
-        || state.statistics.len() != state.splats.len()
-        || state.statistics.count() != SplatState::STATISTICS
-        || state.filter.len() != state.splats.len()
-    {
-        return Err(wrong("its columns have different lengths".into()));
+    let file = SafeTensors::deserialize(bytes).map_err(damaged)?;
+    let tensors = TensorSource::new(&file, "");
+    let state = read_state(tensors).map_err(damaged)?;
+    let progress = read_progress(&file)?;
+    let mut trainer = Trainer::with_empty_state(dataset, recipe, TrainOptions { seed, ..options }, state.len())?;
+    trainer.initial_splats = first_count(&trainer.dataset, &trainer.recipe).min(state.len());
+    // A run begins with more bands than its recipe has at that step only if its first splats had them.
+    trainer.first_sh_degree = state.splats.used_sh_degree();
+    *trainer.engine.state_mut() = state;
+    restore_field(&mut trainer, &file)?;
+    restore_occupants(&mut trainer, &file)?;
+    restore_views(&mut trainer, tensors)?;
+    trainer.pace = progress.pace;
+    trainer.seconds = progress.seconds;
+    trainer.cpu_seconds = progress.cpu_seconds;
+    if let Ok(times) = tensors.required_f64s(TIMES_TENSOR) {
+        let times = times.try_into();
+        trainer.times = Times::from_array(times.map_err(|_| damaged(format!("{TIMES_TENSOR} has the wrong length")))?);
     }
-    let integers = u64s(array("clock.whole", Dtype::U64)?.1);
-    let reals = f64s(array("clock.real", Dtype::F64)?.1);
+    trainer.clock = progress.clock;
+    trainer.restore_filter();
+    Ok(trainer)
+}
+
+/// The splats, their moments, statistics and filter.
+fn read_state(tensors: TensorSource) -> Result<SplatState, String> {
+    let [splats, first_moments, second_moments] = COLUMN_OWNERS;
+    let state = SplatState {
+        splats: read_columns(tensors, splats)?,
+        moments: [
+            read_columns(tensors, first_moments)?,
+            read_columns(tensors, second_moments)?,
+        ],
+        statistics: read_planes(tensors, "statistics")?,
+        filter: read_planes(tensors, "filter")?,
+    };
+    let shapes = column_shapes(&state.splats);
+    let is_consistent = has_consistent_columns(&state.splats)
+        && state.moments.iter().all(|moments| column_shapes(moments) == shapes)
+        && state.statistics.len() == state.splats.len()
+        && state.statistics.count() == SplatState::STATISTICS
+        && state.filter.len() == state.splats.len();
+    if is_consistent {
+        Ok(state)
+    } else {
+        Err("its columns have different lengths".into())
+    }
+}
+
+/// How far a run has come.
+struct Progress {
+    clock: Clock,
+    pace: f64,
+    seconds: f64,
+    cpu_seconds: f64,
+}
+
+fn read_progress(file: &SafeTensors) -> Result<Progress, TrainError> {
+    let tensors = TensorSource::new(file, "");
+    let integers = tensors.required_u64s("clock.whole").map_err(damaged)?;
+    let reals = tensors.required_f64s("clock.real").map_err(damaged)?;
     let (
-        [step, stage, stage_step, was_reset, watched],
+        [step, stage, stage_step, was_reset, monitor_steps],
         [
             time,
             stage_time,
@@ -345,52 +390,9 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
         ],
     ) = (&integers[..], &reals[..])
     else {
-        return Err(wrong("its clock has the wrong length".into()));
+        return Err(damaged("its clock has the wrong length"));
     };
-    let carried = carried::read(&file, unnamed)?;
-    let mut trainer = Trainer::with_empty_state(dataset, recipe, TrainOptions { seed, ..options }, state.len())?;
-    trainer.initial_splats = first_count(&trainer.dataset, &trainer.recipe).min(state.len());
-    // A run begins with more bands than its recipe has at that step only if its first splats had them.
-    trainer.first_sh_degree = state.splats.used_sh_degree();
-    *trainer.engine.state_mut() = state;
-    let tensors = |prefix| TensorSource::new(&file, prefix);
-    if tensors(FIELD_PREFIX).u64s("whole").is_some() {
-        if trainer.recipe.field.is_none() {
-            return Err(wrong("its field and its recipe do not agree".into()));
-        }
-        let fresh = trainer.first_field()?.field;
-        let state = field_file::state_from(fresh.config, fresh.space, tensors(FIELD_PREFIX));
-        trainer.set_field(state.map_err(|why| wrong(format!("{FIELD_PREFIX}{why}")))?)?;
-    }
-    trainer.sockets = trainer.first_sockets()?;
-    // The run may have decided to learn exposures.
-    if trainer.recipe.exposure == Choice::Auto && tensors("exposure.").u64s("steps").is_some() {
-        trainer.sockets.exposure = Some(Exposure::new(trainer.dataset.views.len(), &trainer.dataset.train));
-    }
-    for occupant in trainer.sockets.occupants_mut() {
-        let prefix = format!("{}.", occupant.name());
-        let restored = occupant.restore(TensorSource::new(&file, &prefix));
-        restored.map_err(|why| wrong(format!("{prefix}{why}")))?;
-    }
-    // The run may have left out photographs.
-    if let Some(trained) = tensors("").u64s(TRAINED_TENSOR) {
-        let known = |view: &u64| trainer.dataset.train.contains(&(*view as usize));
-        if trained.is_empty() || !trained.iter().all(known) {
-            return Err(wrong(format!("{TRAINED_TENSOR} and the dataset do not agree")));
-        }
-        trainer.trained = trained.iter().map(|view| *view as usize).collect();
-    }
-    if let Some(pairs) = tensors("").u64s(HIDDEN_TENSOR) {
-        let camera = |view: usize| trainer.dataset.views.get(view).map(|view| &view.camera);
-        trainer.hidden = Hidden::from_pairs(&pairs, camera)
-            .ok_or_else(|| wrong(format!("{HIDDEN_TENSOR} and the dataset do not agree")))?;
-    }
-    (trainer.pace, trainer.seconds, trainer.cpu_seconds) = (*pace, *seconds, *cpu_seconds);
-    if let Ok((_, bytes)) = array(TIMES_TENSOR, Dtype::F64) {
-        let times = f64s(bytes).try_into();
-        trainer.times = Times::from_array(times.map_err(|_| wrong(format!("{TIMES_TENSOR} has the wrong length")))?);
-    }
-    trainer.clock = Clock {
+    let clock = Clock {
         step: *step,
         time: *time,
         progress: *progress,
@@ -398,26 +400,67 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
         stage: *stage as usize,
         stage_time: *stage_time,
         stage_step: *stage_step,
-        carried,
+        carried: carried::read(file, unnamed)?,
         was_reset: *was_reset != 0,
         monitor: ConvergenceMonitor {
             mean: *mean,
-            steps: *watched,
+            steps: *monitor_steps,
             start: *start,
             best: *best,
             best_time: *best_time,
         },
     };
-    trainer.restore_filter();
-    Ok(trainer)
+    Ok(Progress {
+        clock,
+        pace: *pace,
+        seconds: *seconds,
+        cpu_seconds: *cpu_seconds,
+    })
 }
 
-/// Little-endian integers.
-fn u64s(bytes: &[u8]) -> Vec<u64> {
-    bytes.as_chunks().0.iter().map(|b| u64::from_le_bytes(*b)).collect()
+/// The field, if a stage of the run trains one.
+fn restore_field(trainer: &mut Trainer, file: &SafeTensors) -> Result<(), TrainError> {
+    let tensors = TensorSource::new(file, FIELD_PREFIX);
+    if tensors.u64s("whole").is_none() {
+        return Ok(());
+    }
+    if trainer.recipe.field.is_none() {
+        return Err(damaged("its field and its recipe do not agree"));
+    }
+    let fresh = trainer.first_field()?.field;
+    let state = field_file::state_from(fresh.config, fresh.space, tensors);
+    trainer.set_field(state.map_err(|why| damaged(format!("{FIELD_PREFIX}{why}")))?)
 }
 
-/// Little-endian double-precision numbers.
-fn f64s(bytes: &[u8]) -> Vec<f64> {
-    bytes.as_chunks().0.iter().map(|b| f64::from_le_bytes(*b)).collect()
+/// The trained components other than splats and field.
+fn restore_occupants(trainer: &mut Trainer, file: &SafeTensors) -> Result<(), TrainError> {
+    trainer.sockets = trainer.first_sockets()?;
+    // The run may have decided to learn exposures.
+    let exposure = TensorSource::new(file, "exposure.");
+    if trainer.recipe.exposure == Choice::Auto && exposure.u64s("steps").is_some() {
+        trainer.sockets.exposure = Some(Exposure::new(trainer.dataset.views.len(), &trainer.dataset.train));
+    }
+    for occupant in trainer.sockets.occupants_mut() {
+        let prefix = format!("{}.", occupant.name());
+        let restored = occupant.restore(TensorSource::new(file, &prefix));
+        restored.map_err(|why| damaged(format!("{prefix}{why}")))?;
+    }
+    Ok(())
+}
+
+/// The photographs, and parts of them, that the run has left out.
+fn restore_views(trainer: &mut Trainer, tensors: TensorSource) -> Result<(), TrainError> {
+    if let Some(trained) = tensors.u64s(TRAINED_TENSOR) {
+        let known = |view: &u64| trainer.dataset.train.contains(&(*view as usize));
+        if trained.is_empty() || !trained.iter().all(known) {
+            return Err(damaged(format!("{TRAINED_TENSOR} and the dataset do not agree")));
+        }
+        trainer.trained = trained.iter().map(|view| *view as usize).collect();
+    }
+    if let Some(pairs) = tensors.u64s(HIDDEN_TENSOR) {
+        let camera = |view: usize| trainer.dataset.views.get(view).map(|view| &view.camera);
+        trainer.hidden = Hidden::from_pairs(&pairs, camera)
+            .ok_or_else(|| damaged(format!("{HIDDEN_TENSOR} and the dataset do not agree")))?;
+    }
+    Ok(())
 }

@@ -26,7 +26,7 @@ use glam::Vec3;
 use irradia_scene::{Photo, View};
 
 /// Maximum number of training photographs that are examined, evenly spaced.
-const MAX_SAMPLES: usize = 24;
+const MAX_EXAMINED_PHOTOS: usize = 24;
 /// Longer side at which they are read, pixels.
 const SAMPLE_SIDE: u32 = 96;
 /// Minimum fraction of the photographs that are cut-outs, or have a sky.
@@ -160,7 +160,7 @@ impl Trainer {
         let (mut cut_outs, mut photographs) = (0usize, 0usize);
         let (mut sky_colors, mut upright) = (Vec::new(), 0usize);
         if !(skies.is_empty() && cut_out.is_empty()) {
-            let every = self.dataset.train.len().div_ceil(MAX_SAMPLES);
+            let every = self.dataset.train.len().div_ceil(MAX_EXAMINED_PHOTOS);
             let up = |view: &View| view.camera.pose.rotation * Vec3::NEG_Y;
             let train = self.dataset.train.iter().map(|view| &self.dataset.views[*view]);
             let mean_up = train.clone().map(up).sum::<Vec3>().normalize_or_zero();

@@ -63,7 +63,7 @@ pub(crate) fn use_device(
 #[cfg(feature = "gpu")]
 fn supports_field(recipe: &Recipe) -> bool {
     let space = irradia_field::Space::contracted([0.0; 3], 1.0);
-    let config = recipe.field.as_ref().map(|knobs| knobs.config(1, &space, false));
+    let config = recipe.field.as_ref().map(|settings| settings.config(1, &space, false));
     config.is_some_and(|config| irradia_field::gpu::supports(&config))
 }
 

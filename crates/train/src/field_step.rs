@@ -2,8 +2,9 @@
 
 use crate::field_space::field_space;
 use crate::photos::Prepared;
-use crate::recipe::{FieldKnobs, Param, Recipe};
+use crate::recipe::{FieldSettings, Param, Recipe};
 use crate::schedule::{StepMetrics, StepPlan, plan, upcoming_views};
+use crate::stream::Stream;
 use crate::trainer::{TrainError, Trainer};
 use crate::{event::StepReport, recipe::Represents};
 use cpu_time::ProcessTime;
@@ -13,9 +14,6 @@ use irradia_splat::{SplatState, init};
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Random streams, derived from the run's seed.
-const STREAM_FIELD: u64 = 6;
-const STREAM_POINTS: u64 = 7;
 /// Memory of all photographs, bytes, above which a step uses only some of them: 5,500 of 360 x 360.
 pub const MAX_PHOTO_BYTES: usize = 2 << 30;
 /// Bytes of a pixel of a training photograph: four channels, or three and a mask.
@@ -28,16 +26,16 @@ pub fn is_field(recipe: &Recipe, stage: usize) -> bool {
     stage.represents == Represents::Field
 }
 
-/// The field of `knobs` in the space determined by the dataset, and the reason for that space.
+/// The field of `settings` in the space determined by the dataset, and the reason for that space.
 pub fn first_field(
-    knobs: &FieldKnobs,
+    settings: &FieldSettings,
     dataset: &Dataset,
     transparent: bool,
     seed: u64,
 ) -> Result<(FieldState, String), TrainError> {
-    let (space, why) = field_space(knobs.space, dataset, transparent)?;
-    let config = knobs.config(dataset.train.len(), &space, transparent);
-    let field = Field::new(config, space, seed ^ STREAM_FIELD << 40)?;
+    let (space, why) = field_space(settings.space, dataset, transparent)?;
+    let config = settings.config(dataset.train.len(), &space, transparent);
+    let field = Field::new(config, space, Stream::Field.derived_seed(seed))?;
     Ok((FieldState::new(field), why))
 }
 
@@ -80,16 +78,16 @@ impl Trainer {
                 image: numbers[*view],
             })
             .collect();
-        let knobs = self
+        let settings = self
             .recipe
             .field
             .as_ref()
-            .expect("validated: a stage of field has its knobs");
+            .expect("validated: a stage of field has its settings");
         let options = StepOptions {
             table_rate: plan.value(Param::RateTables),
             net_rate: plan.value(Param::RateNets),
             code_rate: plan.value(Param::RateCodes),
-            beta2: knobs.beta2,
+            beta2: settings.beta2,
             interlevel: plan.value(Param::InterlevelWeight),
             distortion: plan.value(Param::DistortionWeight),
             depth: plan.value(Param::DepthWeight),
@@ -98,7 +96,7 @@ impl Trainer {
             } else {
                 Background::Fixed(self.recipe.render.background)
             },
-            samples: knobs.samples,
+            samples: settings.samples,
             update_occupancy: plan.update_occupancy,
             seed: self.options.seed,
         };
@@ -159,14 +157,14 @@ impl Trainer {
     /// # Errors
     /// When the field has no surface.
     pub(crate) fn field_to_splats(&mut self) -> Result<(), TrainError> {
-        let (Some(field), Some(knobs)) = (self.field.take(), &self.recipe.field) else {
+        let (Some(field), Some(settings)) = (self.field.take(), &self.recipe.field) else {
             return Ok(());
         };
         let (started, cpu_started) = (Instant::now(), ProcessTime::now());
         let cameras = self.train_cameras();
         let options = PointsOptions {
-            count: knobs.points.min(self.cap),
-            seed: self.options.seed ^ STREAM_POINTS << 40,
+            count: settings.points.min(self.cap),
+            seed: Stream::FieldPoints.derived_seed(self.options.seed),
             ..PointsOptions::default()
         };
         let found = to_points(&field.state().field, &cameras, &options);

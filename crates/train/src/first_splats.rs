@@ -2,9 +2,10 @@
 
 use crate::field_step::is_field;
 use crate::recipe::Recipe;
-use crate::trainer::{STREAM_INIT, TrainError, Trainer};
+use crate::stream::Stream;
+use crate::trainer::{TrainError, Trainer};
 use glam::Vec2;
-use irradia_scene::{Camera, Dataset, LoadError, PointCloud, Rng, View, sh};
+use irradia_scene::{Camera, Dataset, LoadError, PointCloud, View, sh};
 use irradia_splat::Splats;
 use irradia_splat::init::{self, InitOptions, PixelClass};
 
@@ -44,7 +45,7 @@ impl Trainer {
                 let views: Vec<&View> = chosen.iter().map(|i| &dataset.views[*i]).collect();
                 let cameras: Vec<Camera> = views.iter().map(|v| v.camera).collect();
                 let bounds: Vec<Option<[f32; 2]>> = views.iter().map(|v| v.depth_bounds).collect();
-                let mut rng = Rng::new(self.options.seed, STREAM_INIT);
+                let mut rng = Stream::FirstSplats.rng(self.options.seed);
                 let points = init::random_points(
                     &cameras,
                     &bounds,

@@ -233,8 +233,10 @@ impl Forecast {
 
     /// Work of a step on `count` splats with `pairs` pairs per pixel, microseconds.
     fn work(&self, trainer: &Trainer, step: &UpcomingStretch, count: f64, pairs: f64) -> f64 {
-        if let (Represents::Field, Some(knobs)) = (trainer.recipe.stage[step.stage].represents, &trainer.recipe.field) {
-            return SAMPLE_COST * knobs.samples as f64;
+        if let (Represents::Field, Some(settings)) =
+            (trainer.recipe.stage[step.stage].represents, &trainer.recipe.field)
+        {
+            return SAMPLE_COST * settings.samples as f64;
         }
         let pixels = self.pixels * step.image_scale.powi(2);
         let parameters = GEOMETRY_PARAMETERS + 3.0 * (step.sh_degree + 1.0).powi(2);
@@ -292,8 +294,8 @@ impl Growth {
         let limit = (trainer.limit(stretch.stage, stretch.count_share) as f64).max(self.count);
         let grown = match &stage.density {
             None => self.count,
-            Some(DensityControl::Mcmc(knobs)) => {
-                self.count * f64::from(knobs.growth).powf(stretch.duration / knobs.every as f64)
+            Some(DensityControl::Mcmc(settings)) => {
+                self.count * f64::from(settings.growth).powf(stretch.duration / settings.every as f64)
             }
             Some(DensityControl::Taming(_)) => {
                 let before = stretch.completed - stretch.duration / stage.steps as f64;

@@ -116,9 +116,10 @@ fn distance_to_points(points: &PointCloud, view: &View) -> f32 {
     let eye = view.camera.pose.position;
     let mut distances: Vec<f32> = points.positions.iter().map(|p| p.distance(eye)).collect();
     let at = (distances.len() as f64 * MAX_STRAY_FRACTION) as usize;
-    match distances.is_empty() {
-        true => f32::INFINITY,
-        false => *distances.select_nth_unstable_by(at, f32::total_cmp).1,
+    if distances.is_empty() {
+        f32::INFINITY
+    } else {
+        *distances.select_nth_unstable_by(at, f32::total_cmp).1
     }
 }
 

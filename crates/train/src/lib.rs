@@ -36,6 +36,7 @@ pub mod schedule;
 pub mod socket;
 mod spacing;
 mod splat_step;
+mod stream;
 mod surroundings;
 pub mod tensor_file;
 pub mod times;
@@ -43,5 +44,5 @@ mod trainer;
 mod transients;
 
 pub use recipe::{Recipe, RecipeError};
-pub use run::{RunLimits, run};
+pub use run::{EndReason, RunLimits, run};
 pub use trainer::{TrainError, TrainOptions, Trainer};

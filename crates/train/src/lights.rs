@@ -89,13 +89,13 @@ impl Light<'_> {
 
     /// Applies the photograph's exposure to the frame `color` `[3, H, W]`, which [`render_splats`](crate::model::render_splats) rendered in
     /// this light.
-    pub fn developed<'c>(&self, color: &'c [f32]) -> Cow<'c, [f32]> {
+    pub fn exposed<'c>(&self, color: &'c [f32]) -> Cow<'c, [f32]> {
         let Some(exposures) = &self.lights.exposures else {
             return Cow::Borrowed(color);
         };
-        let mut developed = Vec::new();
-        exposures.develop(self.view, color, &mut developed);
-        Cow::Owned(developed)
+        let mut exposed = Vec::new();
+        exposures.apply(self.view, color, &mut exposed);
+        Cow::Owned(exposed)
     }
 }
 
@@ -124,10 +124,10 @@ mod tests {
         let color = [0.2, 0.4, 0.6];
         for view in 0..3 {
             let mut expected = Vec::new();
-            exposure.develop(view, &color, &mut expected);
-            assert_eq!(*lights.of_view(view).unwrap().developed(&color), expected);
+            exposure.apply(view, &color, &mut expected);
+            assert_eq!(*lights.of_view(view).unwrap().exposed(&color), expected);
         }
-        assert_ne!(*lights.of_view(0).unwrap().developed(&color), color);
+        assert_ne!(*lights.of_view(0).unwrap().exposed(&color), color);
         assert!(lights.of_view(3).is_none());
     }
 
@@ -154,7 +154,7 @@ mod tests {
                 let mut renderer = Renderer::new();
                 let light = lights.of_view(view);
                 render_splats(&splats, residual.as_deref(), light, &mut renderer, &camera, &options);
-                let drawn = light.unwrap().developed(renderer.color()).into_owned();
+                let drawn = light.unwrap().exposed(renderer.color()).into_owned();
                 let (sockets, engine) = (&mut trainer.sockets, &mut trainer.engine);
                 sockets.render(engine, view, camera.into(), &options, &plan);
                 assert_close(&drawn, sockets.frame_color(engine), 1e-5);

@@ -22,7 +22,7 @@ pub enum Model<'a> {
 }
 
 /// Renders the view of `camera` into the buffers of `renderer`, with the colours that `residual` and `light` add; the light's exposure is
-/// applied by [`Light::developed`].
+/// applied by [`Light::exposed`].
 pub fn render_splats(
     splats: &Splats,
     residual: Option<&Field>,

@@ -104,12 +104,13 @@ impl NormalMaps {
             }
         }
         let used = by_view.iter().flatten().count();
-        let found = match share >= MIN_FACING_FRACTION {
-            true => axes.name().to_owned(),
-            false => format!(
+        let found = if share >= MIN_FACING_FRACTION {
+            axes.name().to_owned()
+        } else {
+            format!(
                 "at most {:.0} % of their normals face the cameras in any known axes",
                 100.0 * share
-            ),
+            )
         };
         Self {
             by_view,

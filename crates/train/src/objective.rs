@@ -5,8 +5,8 @@ use crate::photos::Prepared;
 use crate::recipe::Param;
 use crate::schedule::StepPlan;
 use irradia_measure::{
-    CoarseLoss, Crop, DepthKind, DepthLoss, DepthSample, LossWeights, Lpips, NormalLoss, NormalSample, PhotometricLoss,
-    SmoothLoss, Smoothed, Target, Truth, perceptual,
+    CoarseLoss, Crop, DepthGradient, DepthKind, DepthLoss, DepthPlanes, DepthSample, LossWeights, Lpips, NormalLoss,
+    NormalSample, PhotometricLoss, SmoothLoss, Smoothed, Target, Truth, perceptual,
 };
 use irradia_scene::{Intrinsics, Rng};
 use irradia_splat::{FramePlanes, Gather, OutputGradient};
@@ -28,8 +28,7 @@ pub struct Objective {
     pub lpips: Option<Arc<Lpips>>,
     photometric: PhotometricLoss,
     coarse: CoarseLoss,
-    depth: DepthLoss,
-    smooth: SmoothLoss,
+    depth: DepthLosses,
     /// The photograph over the random background.
     recolored: Vec<u8>,
     v_color: Vec<f32>,
@@ -38,6 +37,26 @@ pub struct Objective {
     error: Vec<f32>,
     edges: Vec<f32>,
     present: PresentGradients,
+}
+
+/// The losses on the depth of a frame.
+#[derive(Default)]
+struct DepthLosses {
+    samples: DepthLoss,
+    normals: NormalLoss,
+    smooth: SmoothLoss,
+}
+
+/// The losses on the coverage of a frame that apply to a photograph.
+struct CoverageLosses<'a> {
+    /// Weight of the coverage of what the photograph shows.
+    cover: f32,
+    /// Weight of the difference from the photograph's alpha, `[H, W]`.
+    alpha: Option<(f32, &'a [u8])>,
+    /// Weight of what covers pixels that the mask, `[H, W]`, leaves out.
+    left_out: Option<(f32, &'a [u8])>,
+    /// The photograph's mask, `[H, W]`.
+    mask: Option<&'a [u8]>,
 }
 
 /// Which gradients the last frame has.
@@ -79,8 +98,7 @@ impl Objective {
             lpips,
             photometric: PhotometricLoss::new(),
             coarse: CoarseLoss::default(),
-            depth: DepthLoss::default(),
-            smooth: SmoothLoss::default(),
+            depth: DepthLosses::default(),
             recolored: Vec::new(),
             v_color: Vec::new(),
             v_alpha: Vec::new(),
@@ -115,92 +133,50 @@ impl Objective {
             truth: Truth::Rgb8(rgb),
             mask: photo.mask.as_deref(),
         };
-        let color = frame.color;
         self.v_color.resize(3 * pixels, 0.0);
         let weights = photometric_weights(plan);
-        let values = self.photometric.evaluate(color, &target, &weights, &mut self.v_color);
+        let values = self
+            .photometric
+            .evaluate(frame.color, &target, &weights, &mut self.v_color);
         let mut total = values.total;
-        let weight = plan.value(Param::CoarseWeight);
-        if weight > 0.0 {
+        let coarse_weight = plan.value(Param::CoarseWeight);
+        if coarse_weight > 0.0 {
             let factor = plan.values[Param::CoarseFactor] as usize;
-            let loss = self.coarse.evaluate(color, &target, factor, weight, &mut self.v_color);
-            total += f64::from(weight) * loss;
+            let loss = self
+                .coarse
+                .evaluate(frame.color, &target, factor, coarse_weight, &mut self.v_color);
+            total += f64::from(coarse_weight) * loss;
         }
-        let weight = plan.value(Param::PerceptualWeight);
-        if let Some(lpips) = self.lpips.as_ref().filter(|_| weight > 0.0) {
+        let perceptual_weight = plan.value(Param::PerceptualWeight);
+        if let Some(lpips) = self.lpips.as_ref().filter(|_| perceptual_weight > 0.0) {
             let crop = Crop::random(width, height, CROP_SIDE, rng);
             // Images too small for the network are skipped.
-            if let Ok(loss) = perceptual(lpips, color, &target, crop, weight, &mut self.v_color) {
-                total += f64::from(weight) * loss;
+            if let Ok(loss) = perceptual(lpips, frame.color, &target, crop, perceptual_weight, &mut self.v_color) {
+                total += f64::from(perceptual_weight) * loss;
             }
         }
-        let depths = plan.compares_depth();
-        let maps = [(Param::AlphaWeight, &photo.alpha), (Param::MaskWeight, &photo.mask)];
-        let [alpha, mask] =
-            maps.map(|(param, map)| Some((plan.value(param), map.as_ref()?)).filter(|(weight, _)| *weight > 0.0));
-        let cover = cover_weight(photo, plan);
+        let coverage = CoverageLosses::new(photo, plan);
+        let compares_depth = plan.compares_depth();
         self.present = PresentGradients {
-            depth: depths,
-            alpha: depths || cover > 0.0 || alpha.is_some() || mask.is_some(),
+            depth: compares_depth,
+            alpha: compares_depth || coverage.any(),
         };
         if self.present.alpha {
             clear(&mut self.v_alpha, pixels);
+            coverage.evaluate(frame.alpha, &mut self.v_alpha, &mut total);
         }
-        if cover > 0.0 {
-            let v = cover / pixels as f32;
-            match &photo.mask {
-                Some(mask) => {
-                    for (v_alpha, mask) in self.v_alpha.iter_mut().zip(mask) {
-                        *v_alpha -= v * f32::from(*mask) / 255.0;
-                    }
-                }
-                None => self.v_alpha.fill(-v),
-            }
-        }
-        if let Some((weight, wanted)) = alpha {
-            total += alpha_loss(frame.alpha, wanted, weight, &mut self.v_alpha);
-        }
-        if let Some((weight, mask)) = mask {
-            total += masked_alpha_loss(frame.alpha, mask, weight, &mut self.v_alpha);
-        }
-        if depths {
+        if compares_depth {
             clear(&mut self.v_depth, pixels);
-            let (v_depth, v_alpha) = (&mut self.v_depth, &mut self.v_alpha);
-            let weight = plan.value(Param::DepthWeight);
-            if weight > 0.0 {
-                let kind = DepthKind::Metric;
-                let values = self.depth.evaluate(
-                    frame.depth,
-                    frame.alpha,
-                    reference.depths,
-                    kind,
-                    weight,
-                    v_depth,
-                    v_alpha,
-                );
-                total += f64::from(weight) * values.loss;
-            }
-            let weight = plan.value(Param::DepthMapWeight);
-            if let Some((depths, kind)) = reference.depth_map.filter(|_| weight > 0.0) {
-                let values = self
-                    .depth
-                    .evaluate(frame.depth, frame.alpha, depths, kind, weight, v_depth, v_alpha);
-                total += f64::from(weight) * values.loss;
-            }
-            let weight = plan.value(Param::NormalMapWeight);
-            if let Some((normals, reach, camera)) = reference.normal_map.filter(|_| weight > 0.0) {
-                let (loss, [depth, alpha]) = (NormalLoss::default(), [frame.depth, frame.alpha]);
-                let loss = loss.evaluate(depth, alpha, camera, normals, reach, weight, v_depth, v_alpha);
-                total += f64::from(weight) * loss;
-            }
-            let weight = plan.value(Param::SmoothWeight);
-            if weight > 0.0 {
-                let (of, k) = (Smoothed::Disparity, EDGE_SHARPNESS);
-                let loss = self
-                    .smooth
-                    .evaluate(frame.depth, frame.alpha, &target, of, k, weight, v_depth, v_alpha);
-                total += f64::from(weight) * loss;
-            }
+            let rendered = DepthPlanes {
+                depth: frame.depth,
+                alpha: frame.alpha,
+            };
+            let mut gradient = DepthGradient {
+                depth: &mut self.v_depth,
+                alpha: &mut self.v_alpha,
+            };
+            self.depth
+                .evaluate(rendered, &target, reference, plan, &mut gradient, &mut total);
         }
         ObjectiveValues {
             total,
@@ -232,11 +208,12 @@ impl Objective {
     /// its range, then weighted by `fraction` for edges and 1 - `fraction` for the error.
     pub fn add_edges(&mut self, photo: &Prepared, fraction: f32) {
         edges(photo, &mut self.edges);
-        let (of_error, of_edges) = (unit_range(&self.error), unit_range(&self.edges));
+        let [min_error, error_scale] = unit_range(&self.error);
+        let [min_edge, edge_scale] = unit_range(&self.edges);
         for (i, (error, edge)) in self.error.iter_mut().zip(&self.edges).enumerate() {
             let counts = photo.mask.as_ref().is_none_or(|mask| mask[i] != 0);
             let mixed =
-                (1.0 - fraction) * (*error - of_error[0]) * of_error[1] + fraction * (edge - of_edges[0]) * of_edges[1];
+                (1.0 - fraction) * (*error - min_error) * error_scale + fraction * (edge - min_edge) * edge_scale;
             *error = if counts { mixed } else { 0.0 };
         }
     }
@@ -282,6 +259,87 @@ impl Objective {
     /// The result of [`Objective::error`].
     pub fn gather_error(&self) -> Gather<'_> {
         Gather::Error(&self.error)
+    }
+}
+
+impl DepthLosses {
+    /// Adds the weighted losses of `rendered` to `total`, one by one since the order of the sum determines its rounding, and their gradients
+    /// to `gradient`.
+    fn evaluate(
+        &mut self,
+        rendered: DepthPlanes,
+        target: &Target,
+        reference: &Reference,
+        plan: &StepPlan,
+        gradient: &mut DepthGradient,
+        total: &mut f64,
+    ) {
+        let point_weight = plan.value(Param::DepthWeight);
+        if point_weight > 0.0 {
+            let values = self
+                .samples
+                .evaluate(rendered, reference.depths, DepthKind::Metric, point_weight, gradient);
+            *total += f64::from(point_weight) * values.loss;
+        }
+        let map_weight = plan.value(Param::DepthMapWeight);
+        if let Some((depths, kind)) = reference.depth_map.filter(|_| map_weight > 0.0) {
+            let values = self.samples.evaluate(rendered, depths, kind, map_weight, gradient);
+            *total += f64::from(map_weight) * values.loss;
+        }
+        let normal_weight = plan.value(Param::NormalMapWeight);
+        if let Some((normals, reach, camera)) = reference.normal_map.filter(|_| normal_weight > 0.0) {
+            let loss = self
+                .normals
+                .evaluate(rendered, camera, normals, reach, normal_weight, gradient);
+            *total += f64::from(normal_weight) * loss;
+        }
+        let smooth_weight = plan.value(Param::SmoothWeight);
+        if smooth_weight > 0.0 {
+            let (of, k) = (Smoothed::Disparity, EDGE_SHARPNESS);
+            let loss = self.smooth.evaluate(rendered, target, of, k, smooth_weight, gradient);
+            *total += f64::from(smooth_weight) * loss;
+        }
+    }
+}
+
+impl<'a> CoverageLosses<'a> {
+    fn new(photo: &'a Prepared, plan: &StepPlan) -> Self {
+        let weighted = |param: Param, map: Option<&'a [u8]>| {
+            let weight = plan.value(param);
+            map.filter(|_| weight > 0.0).map(|map| (weight, map))
+        };
+        Self {
+            cover: cover_weight(photo, plan),
+            alpha: weighted(Param::AlphaWeight, photo.alpha.as_deref()),
+            left_out: weighted(Param::MaskWeight, photo.mask.as_deref()),
+            mask: photo.mask.as_deref(),
+        }
+    }
+
+    /// Whether any has a weight.
+    fn any(&self) -> bool {
+        self.cover > 0.0 || self.alpha.is_some() || self.left_out.is_some()
+    }
+
+    /// Adds the weighted losses of the opacities `alpha` `[H, W]` to `total`, and their gradients to `v_alpha`, which is zero.
+    fn evaluate(&self, alpha: &[f32], v_alpha: &mut [f32], total: &mut f64) {
+        if self.cover > 0.0 {
+            let v = self.cover / v_alpha.len() as f32;
+            match self.mask {
+                Some(mask) => {
+                    for (v_alpha, mask) in v_alpha.iter_mut().zip(mask) {
+                        *v_alpha -= v * f32::from(*mask) / 255.0;
+                    }
+                }
+                None => v_alpha.fill(-v),
+            }
+        }
+        if let Some((weight, wanted)) = self.alpha {
+            *total += alpha_loss(alpha, wanted, weight, v_alpha);
+        }
+        if let Some((weight, mask)) = self.left_out {
+            *total += masked_alpha_loss(alpha, mask, weight, v_alpha);
+        }
     }
 }
 

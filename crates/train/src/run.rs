@@ -7,6 +7,7 @@ use crate::half_fit::HalfFit;
 use crate::paces::Paces;
 use crate::schedule::{is_due, plan};
 use crate::trainer::{TrainError, Trainer};
+use std::fmt::{self, Display, Formatter};
 use std::ops::ControlFlow;
 use std::time::{Duration, Instant};
 
@@ -19,6 +20,27 @@ pub struct RunLimits {
     pub budget: Option<f64>,
     /// Paces to repeat; they take precedence over a budget.
     pub paces: Option<Paces>,
+}
+
+/// Why a run ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum EndReason {
+    /// The recipe was followed to its end.
+    RecipeComplete,
+    /// [`RunLimits::until_psnr`] was reached.
+    PsnrReached,
+    /// An observer requested it.
+    Stopped,
+}
+
+impl Display for EndReason {
+    fn fmt(&self, f: &mut Formatter) -> fmt::Result {
+        f.write_str(match self {
+            Self::RecipeComplete => "recipe complete",
+            Self::PsnrReached => "held-out PSNR reached",
+            Self::Stopped => "stopped",
+        })
+    }
 }
 
 /// Fraction of its budget below which a run has ended early.
@@ -61,25 +83,8 @@ pub fn run(
     trainer: &mut Trainer,
     limits: &RunLimits,
     observers: &mut [&mut dyn Observer],
-) -> Result<String, TrainError> {
-    let mut events = vec![Event::Started {
-        recipe: trainer.recipe.name.clone(),
-        step: trainer.clock.step,
-        total_steps: trainer.total_steps(),
-        splats: trainer.engine.len(),
-        parameters: trainer.parameters(),
-        views: trainer.dataset.train.len(),
-    }];
-    let decisions = std::mem::take(&mut trainer.decisions);
-    events.extend(decisions.into_iter().map(|message| Event::Decided { message }));
-    if trainer.clock.step == 0 {
-        events.extend(trainer.warnings().into_iter().map(|message| Event::Warned { message }));
-        events.push(Event::StageEntered {
-            stage: trainer.stage_name().to_owned(),
-            step: 0,
-            seconds: 0.0,
-        });
-    }
+) -> Result<EndReason, TrainError> {
+    let mut events = begin_events(trainer);
     let mut forecast = Forecast::default();
     let mut requests = notify(trainer, &mut events, observers);
     wait_while_paused(trainer, &mut requests, &mut events, observers);
@@ -111,27 +116,8 @@ pub fn run(
         trainer.times.loading += trainer.photos.take_seconds();
         events.insert(0, Event::Step(report));
         if evaluates && !trainer.dataset.test.is_empty() {
-            let (step, seconds, splats) = (trainer.clock.step, trainer.seconds, trainer.engine.len());
-            let started = Instant::now();
-            let views = match limits.until_psnr {
-                None => evenly_spaced(&trainer.dataset.test),
-                // The limit is on the PSNR of all views.
-                Some(_) => trainer.dataset.test.clone(),
-            };
-            let psnr = held_out_psnr(trainer, &views, observers)?;
-            trainer.times.evaluating += started.elapsed().as_secs_f64();
-            if !psnr.is_nan() {
-                events.push(Event::Evaluated {
-                    step,
-                    seconds,
-                    psnr,
-                    splats,
-                    parameters: trainer.parameters(),
-                });
-            }
-            if limits.until_psnr.is_some_and(|limit| psnr >= limit) {
-                reason = Some("held-out PSNR reached");
-            }
+            let is_reached = evaluate_held_out(trainer, limits.until_psnr, &mut events, observers)?;
+            reason = is_reached.then_some(EndReason::PsnrReached);
         }
         requests = notify(trainer, &mut events, observers);
         trainer.times.wall = before + began.elapsed().as_secs_f64();
@@ -152,17 +138,71 @@ pub fn run(
     events.extend(lost_splats_event(trainer));
     events.extend(cpu_loss_warning(trainer));
     events.extend(limits.budget.and_then(|budget| ended_early(trainer, budget)));
-    let stopped = if requests.stop { "stopped" } else { "recipe complete" };
-    let reason = reason.unwrap_or(stopped).to_owned();
+    let reason = reason.unwrap_or(if requests.stop {
+        EndReason::Stopped
+    } else {
+        EndReason::RecipeComplete
+    });
     events.push(Event::Finished {
         step: trainer.clock.step,
         seconds: trainer.seconds,
-        reason: reason.clone(),
+        reason: reason.to_string(),
     });
     while !events.is_empty() {
         notify(trainer, &mut events, observers);
     }
     Ok(reason)
+}
+
+/// The events before the first step of this process. The trainer's decisions are reported once.
+fn begin_events(trainer: &mut Trainer) -> Vec<Event> {
+    let mut events = vec![Event::Started {
+        recipe: trainer.recipe.name.clone(),
+        step: trainer.clock.step,
+        total_steps: trainer.total_steps(),
+        splats: trainer.engine.len(),
+        parameters: trainer.parameters(),
+        views: trainer.dataset.train.len(),
+    }];
+    let decisions = std::mem::take(&mut trainer.decisions);
+    events.extend(decisions.into_iter().map(|message| Event::Decided { message }));
+    if trainer.clock.step == 0 {
+        events.extend(trainer.warnings().into_iter().map(|message| Event::Warned { message }));
+        events.push(Event::StageEntered {
+            stage: trainer.stage_name().to_owned(),
+            step: 0,
+            seconds: 0.0,
+        });
+    }
+    events
+}
+
+/// Evaluates held-out views, and appends the event of it to `events`; returns whether their PSNR has reached `until_psnr`.
+fn evaluate_held_out(
+    trainer: &mut Trainer,
+    until_psnr: Option<f64>,
+    events: &mut Vec<Event>,
+    observers: &[&mut dyn Observer],
+) -> Result<bool, TrainError> {
+    let (step, seconds, splats) = (trainer.clock.step, trainer.seconds, trainer.engine.len());
+    let started = Instant::now();
+    let views = match until_psnr {
+        None => evenly_spaced(&trainer.dataset.test),
+        // The limit is on the PSNR of all views.
+        Some(_) => trainer.dataset.test.clone(),
+    };
+    let psnr = held_out_psnr(trainer, &views, observers)?;
+    trainer.times.evaluating += started.elapsed().as_secs_f64();
+    if !psnr.is_nan() {
+        events.push(Event::Evaluated {
+            step,
+            seconds,
+            psnr,
+            splats,
+            parameters: trainer.parameters(),
+        });
+    }
+    Ok(until_psnr.is_some_and(|limit| psnr >= limit))
 }
 
 /// What became of the first splats, if a run ends with fewer; a warning if hardly any are left.
@@ -318,7 +358,7 @@ mod tests {
         };
         let mut log = DecisionLog::default();
         let reason = run(&mut trainer, &limits, &mut [&mut log]).unwrap();
-        assert_eq!((trainer.clock.step, reason.as_str()), (600, "recipe complete"));
+        assert_eq!((trainer.clock.step, reason), (600, EndReason::RecipeComplete));
         assert!(
             log.0.iter().any(|line| line.contains("of 3600 were needed")),
             "{:?}",

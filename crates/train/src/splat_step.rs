@@ -3,11 +3,14 @@
 use crate::event::{Event, StepReport};
 use crate::first_splats::first_count;
 use crate::objective::{ObjectiveValues, Reference};
+use crate::photos::Prepared;
 use crate::recipe::{AdamKind, DensityControl, LengthUnit, Param};
-use crate::schedule::{Round, StepMetrics, StepPlan, plan, upcoming_views};
+use crate::schedule::{self, Round, StepMetrics, StepPlan, upcoming_views};
+use crate::stream::Stream;
 use crate::trainer::{TrainError, Trainer};
 use cpu_time::ProcessTime;
 use irradia_compute::adam::AdamStep;
+use irradia_measure::{DepthKind, DepthSample, NormalSample};
 use irradia_scene::{Camera, Rng};
 use irradia_splat::densify::{DensityChange, classic, fast, mcmc, merge, taming};
 use irradia_splat::regularize::AngleCap;
@@ -15,23 +18,26 @@ use irradia_splat::{FramePlanes, Gather, Noise, Optimizer, RenderOptions, Statis
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Random streams, derived from the run's seed.
-const STREAM_DENSIFY: u64 = 2;
-const STREAM_STEP: u64 = 5;
 /// Training views over which the convergence error is measured.
 const MAX_MEASURED_VIEWS: usize = 8;
+
+/// Samples of the maps given with a photograph, where it is not masked: depths with their kind, normals with half of their spacing in pixels.
+struct GivenMaps {
+    depths: Option<(Vec<DepthSample>, DepthKind)>,
+    normals: Option<(Vec<NormalSample>, u32)>,
+}
 
 impl Trainer {
     /// One step on splats; events are appended to `events`.
     pub(crate) fn splat_step(&mut self, events: &mut Vec<Event>) -> Result<(StepReport, StepMetrics), TrainError> {
-        let plan = plan(&self.recipe, &self.clock);
+        let plan = schedule::plan(&self.recipe, &self.clock);
         let upcoming = upcoming_views(&self.trained, self.options.seed, &self.clock);
-        let photo = self.photos.get(&upcoming, plan.image_scale)?;
-        let (started, cpu_started) = (Instant::now(), ProcessTime::now());
-        let camera = &self.dataset.views[upcoming[0]].camera;
-        let photo = self.hidden.apply(upcoming[0], camera, &photo).map_or(photo, Arc::new);
-        let mut rng = Rng::new(self.options.seed ^ self.clock.step << 20, STREAM_STEP);
         let view = upcoming[0];
+        let whole_photo = self.photos.get(&upcoming, plan.image_scale)?;
+        let (started, cpu_started) = (Instant::now(), ProcessTime::now());
+        let hidden = self.hidden.apply(view, &self.dataset.views[view].camera, &whole_photo);
+        let photo = hidden.map_or(whole_photo, Arc::new);
+        let mut rng = Stream::SplatStep.step_rng(self.options.seed, self.clock.step);
         let placement = self.sockets.place(view, &self.scaled_camera(view, plan.image_scale));
         let camera = placement.camera;
         if plan.refilter {
@@ -48,33 +54,24 @@ impl Trainer {
             depth: plan.compares_depth(),
             ..base
         };
-        let mut depth_map = self.given_depths(view, &camera, &plan);
-        let mut normal_map = self.given_normals(view, &camera, &plan);
-        if let Some(mask) = &photo.mask {
-            // Maps also show what is masked, such as people in front of the scene.
-            if let Some((samples, _)) = &mut depth_map {
-                samples.retain(|sample| mask[sample.pixel as usize] > 0);
-            }
-            if let Some((samples, _)) = &mut normal_map {
-                samples.retain(|sample| mask[(sample.pixel[1] * photo.width + sample.pixel[0]) as usize] > 0);
-            }
-        }
+        let maps = self.given_maps(view, &photo, &camera, &plan);
         let reference = Reference {
             photo: &photo,
             background,
             depths: &self.known_depths(view, &camera, &plan),
-            depth_map: depth_map.as_ref().map(|(samples, kind)| (&samples[..], *kind)),
-            normal_map: normal_map
+            depth_map: maps.depths.as_ref().map(|(samples, kind)| (&samples[..], *kind)),
+            normal_map: maps
+                .normals
                 .as_ref()
                 .map(|(samples, reach)| (&samples[..], *reach, &camera.intrinsics)),
         };
         let (update, has_lpips) = (self.update(&plan, view, &camera), self.options.lpips.is_some());
-        let ahead = self.sockets.is_empty().then(|| {
+        let on_device = self.sockets.is_empty().then(|| {
             let frame = (&camera, &options);
             self.device_loss
                 .whole_step(&mut self.engine, frame, &reference, &plan, &update, has_lpips)
         });
-        let loss = match ahead.flatten() {
+        let loss = match on_device.flatten() {
             Some(loss) => loss,
             None => {
                 self.sockets.render(&mut self.engine, view, placement, &options, &plan);
@@ -109,6 +106,22 @@ impl Trainer {
             ..self.step_report(view, loss.total, loss.mse)
         };
         Ok((report, metrics))
+    }
+
+    /// The samples of the maps given with the photograph of `view`, at the pixels of `camera`.
+    fn given_maps(&mut self, view: usize, photo: &Prepared, camera: &Camera, plan: &StepPlan) -> GivenMaps {
+        let mut depths = self.given_depths(view, camera, plan);
+        let mut normals = self.given_normals(view, camera, plan);
+        if let Some(mask) = &photo.mask {
+            // Maps also show what is masked, such as people in front of the scene.
+            if let Some((samples, _)) = &mut depths {
+                samples.retain(|sample| mask[sample.pixel as usize] > 0);
+            }
+            if let Some((samples, _)) = &mut normals {
+                samples.retain(|sample| mask[(sample.pixel[1] * photo.width + sample.pixel[0]) as usize] > 0);
+            }
+        }
+        GivenMaps { depths, normals }
     }
 
     /// The losses of the last frame, and its backward pass.
@@ -156,8 +169,8 @@ impl Trainer {
 
     /// The splat update of this step, whose view `view` is seen by `camera`.
     fn update(&self, plan: &StepPlan, view: usize, camera: &Camera) -> Update {
-        let longer = self.pace.min(1.0).powf(f64::from(self.recipe.length_exponent)) as f32;
-        let mut rates = plan.rates().scaled(longer);
+        let rate_factor = self.pace.min(1.0).powf(f64::from(self.recipe.length_exponent)) as f32;
+        let mut rates = plan.rates().scaled(rate_factor);
         // The rate at the depth of most of the scene.
         let typical_rate = rates.means * self.rate_extent;
         if self.recipe.extent_pixels > 0.0 {
@@ -214,7 +227,7 @@ impl Trainer {
         let change = plan.densify.as_ref().map(|round| self.densify(round));
         let merged = plan
             .merge
-            .map(|knobs| merge::merge(self.engine.state_mut(), &knobs.options()));
+            .map(|settings| merge::merge(self.engine.state_mut(), &settings.options()));
         if let Some(ceiling) = plan.reset_opacity {
             self.engine.edit_density(|state| classic::reset_opacity(state, ceiling));
         }
@@ -236,7 +249,7 @@ impl Trainer {
             .limit(self.clock.stage, round.count_share)
             .min(self.engine.max_splats());
         let first = first_count(&self.dataset, &self.recipe);
-        let mut rng = Rng::new(self.options.seed ^ self.clock.step << 20, STREAM_DENSIFY);
+        let mut rng = Stream::Density.step_rng(self.options.seed, self.clock.step);
         self.engine.edit_density(|state| {
             let cleared = self.free_space.clear(state);
             if let Some(surroundings) = &self.surroundings {
@@ -244,19 +257,21 @@ impl Trainer {
             }
             let limit = limit.min(self.memory.splats_at(intersections, state.len(), pixels));
             let change = match round.density {
-                DensityControl::Classic(knobs) => {
-                    let options = knobs.options(self.extent, round.prune_large, limit);
+                DensityControl::Classic(settings) => {
+                    let options = settings.options(self.extent, round.prune_large, limit);
                     classic::densify(state, &options, &mut rng)
                 }
-                DensityControl::Mcmc(knobs) => mcmc::densify(state, &knobs.options(self.pace, limit), &mut rng),
-                DensityControl::Taming(knobs) => {
+                DensityControl::Mcmc(settings) => mcmc::densify(state, &settings.options(self.pace, limit), &mut rng),
+                DensityControl::Taming(settings) => {
                     let target = taming::next_count(state.len(), limit, round.completed);
-                    let options = knobs.options(self.extent, round.prune_large, round.number, target);
+                    let options = settings.options(self.extent, round.prune_large, round.number, target);
                     taming::densify(state, &options, &mut rng)
                 }
-                DensityControl::Fast(knobs) => {
-                    let floor = ((f64::from(knobs.floor) * self.pixels) as usize).min(first).min(limit);
-                    fast::densify(state, &knobs.options(self.pace, floor, limit))
+                DensityControl::Fast(settings) => {
+                    let floor = ((f64::from(settings.floor) * self.pixels) as usize)
+                        .min(first)
+                        .min(limit);
+                    fast::densify(state, &settings.options(self.pace, floor, limit))
                 }
             };
             DensityChange {

@@ -90,22 +90,24 @@ impl<'a> TensorSource<'a> {
         Self { file, prefix }
     }
 
-    fn view(&self, name: &str, dtype: Dtype) -> Option<TensorView<'a>> {
-        let view = self.file.tensor(&format!("{}{name}", self.prefix)).ok()?;
-        (view.dtype() == dtype).then_some(view)
+    /// The tensor named `name`, of type `dtype`.
+    ///
+    /// # Errors
+    /// One line, when it is missing or of another type.
+    pub(crate) fn view(&self, name: &str, dtype: Dtype) -> Result<TensorView<'a>, String> {
+        let name = format!("{}{name}", self.prefix);
+        let view = self.file.tensor(&name).map_err(|error| error.to_string())?;
+        if view.dtype() == dtype {
+            Ok(view)
+        } else {
+            Err(format!("{name} is not {dtype:?}"))
+        }
     }
 
     /// The 32-bit floats named `name`.
     pub fn f32s(&self, name: &str) -> Option<Vec<f32>> {
-        let view = self.view(name, Dtype::F32)?;
-        Some(
-            view.data()
-                .as_chunks()
-                .0
-                .iter()
-                .map(|b| f32::from_le_bytes(*b))
-                .collect(),
-        )
+        let view = self.view(name, Dtype::F32).ok()?;
+        Some(decoded(&view, f32::from_le_bytes))
     }
 
     /// The 32-bit floats named `name`, of shape `[rows, N]`.
@@ -113,24 +115,38 @@ impl<'a> TensorSource<'a> {
     /// # Errors
     /// One line, when they are missing or of another shape.
     pub fn rows<const N: usize>(&self, name: &str, rows: usize) -> Result<Vec<[f32; N]>, String> {
-        let view = self.view(name, Dtype::F32).ok_or(format!("{name} is missing"))?;
+        let view = self.view(name, Dtype::F32).map_err(|_| format!("{name} is missing"))?;
         if view.shape() != [rows, N] {
             return Err(format!("{name} has the shape {:?}, not [{rows}, {N}]", view.shape()));
         }
-        let values = self.f32s(name).unwrap_or_default();
+        let values = decoded(&view, f32::from_le_bytes);
         Ok(values.as_chunks().0.to_vec())
     }
 
     /// The integers named `name`.
     pub fn u64s(&self, name: &str) -> Option<Vec<u64>> {
-        let view = self.view(name, Dtype::U64)?;
-        Some(
-            view.data()
-                .as_chunks()
-                .0
-                .iter()
-                .map(|b| u64::from_le_bytes(*b))
-                .collect(),
-        )
+        self.required_u64s(name).ok()
     }
+
+    /// The integers named `name`.
+    ///
+    /// # Errors
+    /// One line, when they are missing or of another type.
+    pub(crate) fn required_u64s(&self, name: &str) -> Result<Vec<u64>, String> {
+        Ok(decoded(&self.view(name, Dtype::U64)?, u64::from_le_bytes))
+    }
+
+    /// The double-precision numbers named `name`.
+    ///
+    /// # Errors
+    /// One line, when they are missing or of another type.
+    pub(crate) fn required_f64s(&self, name: &str) -> Result<Vec<f64>, String> {
+        Ok(decoded(&self.view(name, Dtype::F64)?, f64::from_le_bytes))
+    }
+}
+
+/// The numbers of a tensor, each of `N` bytes.
+fn decoded<T, const N: usize>(view: &TensorView, from_bytes: impl Fn([u8; N]) -> T) -> Vec<T> {
+    let bytes = view.data().as_chunks::<N>().0;
+    bytes.iter().map(|bytes| from_bytes(*bytes)).collect()
 }

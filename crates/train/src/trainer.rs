@@ -110,9 +110,6 @@ impl Default for TrainOptions {
     }
 }
 
-/// Random streams derived from the run's seed, one per use.
-pub(crate) const STREAM_INIT: u64 = 1;
-
 /// A run of sparse photographs has at least the recipe's own number of steps divided by this.
 const MAX_SPARSE_DIVISOR: u64 = 5;
 
@@ -297,12 +294,12 @@ impl Trainer {
     /// The recipe's field, untrained.
     pub(crate) fn first_field(&mut self) -> Result<FieldState, TrainError> {
         let transparent = self.transparent()?;
-        let knobs = self
+        let settings = self
             .recipe
             .field
             .as_ref()
-            .expect("validated: a stage of field has its knobs");
-        let (field, why) = first_field(knobs, &self.dataset, transparent, self.options.seed)?;
+            .expect("validated: a stage of field has its settings");
+        let (field, why) = first_field(settings, &self.dataset, transparent, self.options.seed)?;
         self.decisions.push(format!("the field's space is {why}"));
         Ok(field)
     }

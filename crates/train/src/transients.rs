@@ -51,7 +51,7 @@ struct Grid {
 
 impl Grid {
     /// The grid of photographs with the full-size intrinsics `k`.
-    fn of(k: &Intrinsics) -> Self {
+    fn from_intrinsics(k: &Intrinsics) -> Self {
         let blocks = |side: u32| (LONG_SIDE_BLOCKS * side).div_ceil(k.width.max(k.height)) as usize;
         Self {
             columns: blocks(k.width),
@@ -101,7 +101,7 @@ impl Difference {
     pub fn new(frame: &FramePlanes, photo: &Prepared, camera: &Camera, extent: f32) -> Self {
         let (width, height) = (photo.width as usize, photo.height as usize);
         let pixels = width * height;
-        let grid = Grid::of(&camera.intrinsics);
+        let grid = Grid::from_intrinsics(&camera.intrinsics);
         let block = |i: usize| {
             let [columns, rows] = [
                 (i % grid.columns, grid.columns, width),
@@ -253,7 +253,7 @@ impl Hidden {
     /// `photo` of `view` with its hidden blocks masked; `None` if there are none. `camera` is that of the view at full size.
     pub fn apply(&self, view: usize, camera: &Camera, photo: &Prepared) -> Option<Prepared> {
         let blocks = self.0.get(&view)?;
-        let grid = Grid::of(&camera.intrinsics);
+        let grid = Grid::from_intrinsics(&camera.intrinsics);
         let (width, height) = (photo.width as usize, photo.height as usize);
         let mut mask = photo.mask.clone().unwrap_or_else(|| vec![255; width * height]);
         for (y, row) in mask.chunks_exact_mut(width).enumerate() {
@@ -288,7 +288,7 @@ impl Hidden {
         let (pairs, []) = pairs.as_chunks() else { return None };
         for [view, block] in pairs {
             let view = *view as usize;
-            let blocks = Grid::of(&camera(view)?.intrinsics).len();
+            let blocks = Grid::from_intrinsics(&camera(view)?.intrinsics).len();
             let blocks = hidden.entry(view).or_insert_with(|| vec![false; blocks]);
             *blocks.get_mut(*block as usize)? = true;
         }

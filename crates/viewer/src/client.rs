@@ -27,12 +27,15 @@ const SEND_TIMEOUT: Duration = Duration::from_secs(20);
 const NEWS_INTERVAL: Duration = Duration::from_millis(250);
 
 /// Disconnects the client however the task ends.
-struct ClientGuard(Arc<Shared>, u64);
+struct ClientGuard {
+    shared: Arc<Shared>,
+    client: u64,
+}
 
 impl Drop for ClientGuard {
     fn drop(&mut self) {
-        let Self(shared, client) = self;
-        shared.scheduler.disconnect(*client);
+        let shared = &self.shared;
+        shared.scheduler.disconnect(self.client);
         if let Some(live) = &shared.subject.live
             && shared.scheduler.len() == 0
         {
@@ -46,7 +49,7 @@ pub(crate) async fn serve(mut socket: WebSocket, shared: Arc<Shared>) {
     let (outbox, mut inbox) = mpsc::channel(OUTBOX_CAPACITY);
     let Some(client) = shared.scheduler.connect(outbox) else {
         shared.notices.report_once(
-            "seats",
+            "too many pages",
             format_args!("more than {MAX_CLIENTS} pages: further ones are rejected"),
         );
         let reason = CloseFrame {
@@ -56,7 +59,10 @@ pub(crate) async fn serve(mut socket: WebSocket, shared: Arc<Shared>) {
         let _ = timeout(SEND_TIMEOUT, socket.send(Message::Close(Some(reason)))).await;
         return;
     };
-    let client = ClientGuard(shared.clone(), client);
+    let _guard = ClientGuard {
+        shared: shared.clone(),
+        client,
+    };
     if let Some(live) = &shared.subject.live {
         live.page_opened();
     }
@@ -75,7 +81,7 @@ pub(crate) async fn serve(mut socket: WebSocket, shared: Arc<Shared>) {
     loop {
         tokio::select! {
             message = socket.recv() => match message {
-                Some(Ok(message)) => match handle(&shared, client.1, message, &mut limiter) {
+                Some(Ok(message)) => match handle(&shared, client, message, &mut limiter) {
                     Outcome::Continue => {}
                     Outcome::Closed => return,
                     Outcome::Rejected(why) => {

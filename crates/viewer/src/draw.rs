@@ -1,9 +1,9 @@
 //! The drawing thread: takes one task after another from the scheduler.
 
-use crate::message::{PictureHeader, Shot, picture};
+use crate::message::{Mode, PictureHeader, Shot, picture};
 use crate::pace::Detail;
 use crate::paint::{Painter, Picture};
-use crate::scheduler::{SceneStatus, Scheduler, Task};
+use crate::scheduler::{DrawnPicture, SceneStatus, Scheduler, Task};
 use crate::subject::{Edition, Subject};
 use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
 use serde_json::json;
@@ -18,38 +18,30 @@ const COPY_RATE: f32 = 1.5e9;
 
 /// Draws until the scheduler closes.
 pub(crate) fn draw(subject: &Subject, scheduler: &Scheduler) {
-    let mut painter = Painter::default();
-    // The version whose successor has been requested.
-    let mut renewed = 0;
-    let now = || SceneStatus {
+    let mut drawing = Drawing {
+        subject,
+        scheduler,
+        painter: Painter::new(&subject.views),
+        renewed: 0,
+    };
+    let status = || SceneStatus {
         version: subject.edition().map_or(0, |edition| edition.version),
         training: subject.live.as_ref().is_some_and(|live| live.is_training()),
     };
-    while let Some((client, task)) = scheduler.next(now) {
+    while let Some((client, task)) = scheduler.next(status) {
         let Some(edition) = subject.edition() else { continue };
         match task {
-            Task::Picture { shot, detail } => {
-                draw_picture(
-                    subject,
-                    scheduler,
-                    &mut painter,
-                    &edition,
-                    client,
-                    &shot,
-                    detail,
-                    &mut renewed,
-                );
-            }
+            Task::Picture { shot, detail } => drawing.draw_picture(&edition, client, &shot, detail),
             Task::Pick { x, y, tag, shot } => {
                 if let Some(shot) = shot.check() {
-                    let picked = painter.pick(&edition, &shot, x, y, tag);
+                    let picked = drawing.painter.pick(&edition, &shot, x, y, tag);
                     let mut message = serde_json::to_value(&picked).expect("plain data");
                     message["tell"] = "picked".into();
                     scheduler.send_text(client, message.to_string());
                 }
             }
             Task::Score { view } => {
-                let psnr = painter.score(&edition, view, &subject.views.0[view]);
+                let psnr = drawing.painter.score(&edition, view);
                 let message = json!({ "tell": "score", "view": view, "psnr": psnr, "step": edition.step() });
                 scheduler.send_text(client, message.to_string());
             }
@@ -57,61 +49,64 @@ pub(crate) fn draw(subject: &Subject, scheduler: &Scheduler) {
     }
 }
 
-fn draw_picture(
-    subject: &Subject,
-    scheduler: &Scheduler,
-    painter: &mut Painter,
-    edition: &Edition,
-    client: u64,
-    shot: &Shot,
-    detail: Detail,
-    renewed: &mut u64,
-) {
-    let opened = Instant::now();
-    painter.prepare(edition, shot, &detail);
-    // Work that is done once per version is not part of a picture's cost.
-    let started = Instant::now();
-    let k = shot.camera.intrinsics.scaled(detail.pixels.sqrt());
-    let view = shot.view.and_then(|view| subject.views.0.get(view));
-    // Its photograph may be missing: then colours are drawn instead of errors.
-    let shot_drawn = match view.is_some_and(|view| view.photo.is_some()) {
-        true => *shot,
-        false => Shot {
-            mode: if shot.mode == crate::message::Mode::Error {
-                Default::default()
-            } else {
-                shot.mode
-            },
-            ..*shot
-        },
-    };
-    let wanted = || scheduler.is_current(client, shot);
-    let Some(drawn) = painter.paint(edition, &shot_drawn, &detail, (k.width, k.height), view, &wanted) else {
-        return;
-    };
-    let jpeg = to_jpeg(&drawn, if detail.sharp { SHARP_QUALITY } else { MOVING_QUALITY });
-    let seconds = started.elapsed().as_secs_f32();
-    let header = PictureHeader {
-        id: shot.id,
-        width: drawn.width,
-        height: drawn.height,
-        sharp: detail.sharp,
-        version: edition.version,
-        milliseconds: 1e3 * seconds,
-        range: drawn.range,
-    };
-    let pixels = drawn.width as f32 * drawn.height as f32;
-    let bytes = picture(&header, &jpeg);
-    scheduler.deliver(client, shot, detail, bytes, pixels, seconds, edition.version);
-    if let Some(live) = &subject.live {
-        let seconds = opened.elapsed().as_secs_f32();
-        if detail.moving {
-            scheduler.pause_drawing(seconds);
+/// The state of the drawing thread.
+struct Drawing<'a> {
+    subject: &'a Subject,
+    scheduler: &'a Scheduler,
+    painter: Painter<'a>,
+    /// The version whose successor has been requested.
+    renewed: u64,
+}
+
+impl Drawing<'_> {
+    fn draw_picture(&mut self, edition: &Edition, client: u64, shot: &Shot, detail: Detail) {
+        let (subject, scheduler) = (self.subject, self.scheduler);
+        let opened = Instant::now();
+        self.painter.prepare(edition, shot, &detail);
+        // Work that is done once per version is not part of a picture's cost.
+        let started = Instant::now();
+        let view = shot.view.and_then(|view| subject.views.0.get(view));
+        let mut shot_drawn = *shot;
+        if shot.mode == Mode::Error && view.is_none_or(|view| view.photo.is_none()) {
+            // Without a photograph there are no errors: colours are drawn instead.
+            shot_drawn.mode = Mode::Color;
         }
-        if *renewed < edition.version {
-            *renewed = edition.version;
-            let copied = edition.scene().model.splats().map_or(0, |splats| splats.bytes());
-            live.set_due(scheduler.schedule_renewal(seconds, copied as f32 / COPY_RATE));
+        let wanted = || scheduler.is_current(client, shot);
+        let Some(drawn) = self.painter.paint(edition, &shot_drawn, &detail, &wanted) else {
+            return;
+        };
+        let jpeg = to_jpeg(&drawn, if detail.sharp { SHARP_QUALITY } else { MOVING_QUALITY });
+        let seconds = started.elapsed().as_secs_f32();
+        let header = PictureHeader {
+            id: shot.id,
+            width: drawn.width,
+            height: drawn.height,
+            sharp: detail.sharp,
+            version: edition.version,
+            milliseconds: 1e3 * seconds,
+            range: drawn.range,
+        };
+        scheduler.deliver(
+            client,
+            DrawnPicture {
+                id: shot.id,
+                version: edition.version,
+                detail,
+                pixels: drawn.width as f32 * drawn.height as f32,
+                seconds,
+                bytes: picture(&header, &jpeg),
+            },
+        );
+        if let Some(live) = &subject.live {
+            let seconds = opened.elapsed().as_secs_f32();
+            if detail.moving {
+                scheduler.pause_drawing(seconds);
+            }
+            if self.renewed < edition.version {
+                self.renewed = edition.version;
+                let copied = edition.scene().model.splats().map_or(0, |splats| splats.bytes());
+                live.set_due(scheduler.schedule_renewal(seconds, copied as f32 / COPY_RATE));
+            }
         }
     }
 }

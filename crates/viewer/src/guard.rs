@@ -88,9 +88,10 @@ impl Guard {
         let mut pairs = cookies
             .flat_map(|line| line.split(';'))
             .filter_map(|pair| pair.trim().split_once('='));
-        match pairs.any(|(name, value)| name == TOKEN_NAME && constant_time_eq(value, token)) {
-            true => Ok(Entry::Plain),
-            false => Err(Refusal::Token),
+        if pairs.any(|(name, value)| name == TOKEN_NAME && constant_time_eq(value, token)) {
+            Ok(Entry::Plain)
+        } else {
+            Err(Refusal::Token)
         }
     }
 

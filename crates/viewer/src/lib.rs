@@ -53,6 +53,7 @@ mod views;
 pub use error::ViewerError;
 pub use listen::{DEFAULT_PORT, Listen};
 pub use live::Watcher;
+pub use notices::LineSink;
 pub use share::{ShareOptions, Shared, share};
 pub use subject::Subject;
 pub use viewer::Viewer;

@@ -6,9 +6,10 @@ use crate::message::{Mode, Picked, PickedSplat, Shot};
 use crate::pace::Detail;
 use crate::palette;
 use crate::subject::Edition;
-use crate::views::SeenView;
+use crate::views::Views;
 use glam::{Vec2, Vec3};
 use irradia_field::{Field, render_view};
+use irradia_runs::psnr_8_bits;
 use irradia_scene::{Camera, Intrinsics, Photo, sh};
 use irradia_splat::render::Shape;
 use irradia_splat::{RenderOptions, Renderer, Splats};
@@ -46,8 +47,8 @@ struct Planes {
 }
 
 /// Draws pictures; reuses its buffers from picture to picture.
-#[derive(Default)]
-pub(crate) struct Painter {
+pub(crate) struct Painter<'a> {
+    views: &'a Views,
     renderer: Renderer,
     /// The most important splats of a version, most important first.
     important: Option<ImportantSplats>,
@@ -84,12 +85,31 @@ enum Part {
     Level(usize),
 }
 
+/// The splats to draw if nothing is altered.
+struct ChosenSplats<'a> {
+    part: Part,
+    splats: &'a Splats,
+    /// Their indices in the scene, if they are the most important ones.
+    order: Option<&'a [u32]>,
+}
+
 /// Whether levels of detail may replace the scene: not if individual splats are shown, or selected ones are tinted.
 fn has_levels(edition: &Edition, shot: &Shot) -> bool {
     !edition.levels.all().is_empty() && shot.mode == Mode::Color && !(shot.highlight && edition.selected.is_some())
 }
 
-impl Painter {
+impl<'a> Painter<'a> {
+    /// A painter of a scene with these views.
+    pub fn new(views: &'a Views) -> Self {
+        Self {
+            views,
+            renderer: Renderer::default(),
+            important: None,
+            altered: None,
+            photo: None,
+        }
+    }
+
     /// Prepares what pictures of this detail need, once per version.
     pub fn prepare(&mut self, edition: &Edition, shot: &Shot, detail: &Detail) {
         if detail.splats == 1.0
@@ -113,63 +133,63 @@ impl Painter {
         });
     }
 
-    /// Draws `shot` with `width` x `height` pixels, after [`Self::prepare`]; `None` if it is no longer wanted, or its photograph cannot be
-    /// read.
+    /// Draws `shot` in this detail, after [`Self::prepare`]; `None` if it is no longer wanted, or its photograph cannot be read.
     pub fn paint(
         &mut self,
         edition: &Edition,
         shot: &Shot,
         detail: &Detail,
-        (width, height): (u32, u32),
-        view: Option<&SeenView>,
         wanted: &(dyn Fn() -> bool + Sync),
     ) -> Option<Picture> {
         let scene = edition.scene();
         let mut camera = shot.camera;
-        camera.intrinsics = camera.intrinsics.resized(width, height);
+        camera.intrinsics = camera.intrinsics.scaled(detail.pixels.sqrt());
+        let [width, height] = [camera.intrinsics.width, camera.intrinsics.height];
         let options = RenderOptions {
             background: shot.background.unwrap_or(scene.options.background),
             depth: shot.mode == Mode::Depth,
             ..scene.options
         };
-        let (rgb, range) = match (&scene.model, shot.mode) {
-            (Model::Splats { splats, residual }, mode) => {
+        let has_normals = shot.mode == Mode::Normals;
+        let (rgb, range) = match &scene.model {
+            Model::Splats { splats, residual } => {
                 let important = self.important.take();
-                let number = match detail.moving && has_levels(edition, shot) {
-                    true => edition.levels.choose(&camera, detail.splats),
-                    false => 0,
+                let number = if detail.moving && has_levels(edition, shot) {
+                    edition.levels.choose(&camera, detail.splats)
+                } else {
+                    0
                 };
                 let level = edition.levels.get(number);
                 let few = important.as_ref().filter(|_| detail.splats < 1.0 && level.is_none());
                 let options = RenderOptions {
-                    sh_degree: if mode == Mode::Normals { 0 } else { options.sh_degree },
+                    sh_degree: if has_normals { 0 } else { options.sh_degree },
                     first: few.map_or(usize::MAX, |_| (detail.splats * splats.len() as f32) as usize),
                     ..options
                 };
-                let part = match few {
-                    Some(_) => Part::Important,
-                    None => Part::Level(number),
+                let chosen = match few {
+                    Some(important) => ChosenSplats {
+                        part: Part::Important,
+                        splats: &important.splats,
+                        order: Some(&important.order),
+                    },
+                    None => ChosenSplats {
+                        part: Part::Level(number),
+                        splats: level.unwrap_or(splats),
+                        order: None,
+                    },
                 };
-                let splats = few.map_or(level.unwrap_or(splats), |important| &important.splats);
-                let altered = self.altered(
-                    edition,
-                    splats,
-                    part,
-                    few.map(|important| &important.order[..]),
-                    shot,
-                    &camera,
-                );
-                let splats = altered.as_ref().map_or(splats, |(_, splats)| splats);
-                let residual = residual.as_deref().filter(|_| mode != Mode::Normals);
-                let light = light_of(edition, shot.light).filter(|_| mode != Mode::Normals);
+                let altered = self.altered(edition, shot, &chosen);
+                let splats = altered.as_ref().map_or(chosen.splats, |(_, splats)| splats);
+                let residual = residual.as_deref().filter(|_| !has_normals);
+                let light = light_of(edition, shot.light).filter(|_| !has_normals);
                 render_splats(splats, residual, light, &mut self.renderer, &camera, &options);
-                let drawn = self.splats_picture(mode, &options, (width, height), shot, light, view);
+                let drawn = self.splats_picture(shot, &options, [width, height], light);
                 (self.altered, self.important) = (altered, important);
                 drawn?
             }
-            (Model::Field(field), mode) => {
-                let planes = field_planes(field, &camera, &options, mode == Mode::Normals, wanted)?;
-                self.planes_picture(mode, &planes, options.background, (width, height), shot, view)?
+            Model::Field(field) => {
+                let planes = field_planes(field, &camera, &options, has_normals, wanted)?;
+                self.planes_picture(shot, &planes, options.background, [width, height])?
             }
         };
         Some(Picture {
@@ -180,21 +200,13 @@ impl Painter {
         })
     }
 
-    /// The splats to draw instead of the scene's, made for this camera; `order` if they are the most important ones.
-    fn altered(
-        &mut self,
-        edition: &Edition,
-        splats: &Splats,
-        part: Part,
-        order: Option<&[u32]>,
-        shot: &Shot,
-        camera: &Camera,
-    ) -> Option<(Alteration, Splats)> {
+    /// The splats to draw instead of `chosen`, made for this camera; `None` if nothing is altered.
+    fn altered(&mut self, edition: &Edition, shot: &Shot, chosen: &ChosenSplats) -> Option<(Alteration, Splats)> {
         let has_colors = matches!(shot.mode, Mode::Color | Mode::Ellipses | Mode::Rings | Mode::Points);
         let selected = edition.selected.as_deref().filter(|_| shot.highlight && has_colors);
         let alteration = Alteration {
             version: edition.version,
-            part,
+            part: chosen.part,
             clip: shot.clip,
             normals: shot.mode == Mode::Normals,
             highlight: selected.is_some(),
@@ -204,28 +216,28 @@ impl Painter {
         }
         let kept = self.altered.take().filter(|(kept, _)| *kept == alteration);
         let (_, mut altered) = kept.unwrap_or_else(|| {
-            let mut altered = alter(splats, &alteration);
+            let mut altered = alter(chosen.splats, &alteration);
             if let Some(selected) = selected {
-                tint(&mut altered, |i| selected[order.map_or(i, |order| order[i] as usize)]);
+                tint(&mut altered, |i| {
+                    selected[chosen.order.map_or(i, |order| order[i] as usize)]
+                });
             }
             (alteration, altered)
         });
         if alteration.normals {
-            orient_normals(&mut altered, camera.pose.position);
+            orient_normals(&mut altered, shot.camera.pose.position);
         }
         Some((alteration, altered))
     }
 
     fn splats_picture(
         &mut self,
-        mode: Mode,
-        options: &RenderOptions,
-        size: (u32, u32),
         shot: &Shot,
+        options: &RenderOptions,
+        size: [u32; 2],
         light: Option<Light>,
-        view: Option<&SeenView>,
     ) -> Option<(Vec<u8>, Option<[f32; 2]>)> {
-        let shape = match mode {
+        let shape = match shot.mode {
             Mode::Ellipses => Some(Shape::Ellipses),
             Mode::Rings => Some(Shape::Rings),
             Mode::Points => Some(Shape::Points),
@@ -234,11 +246,11 @@ impl Painter {
         if let Some(shape) = shape {
             return Some((to_rgb(&self.renderer.shapes(shape, options.background)), None));
         }
-        if mode == Mode::Count {
+        if shot.mode == Mode::Count {
             return Some(counts_picture(&self.renderer.counts()));
         }
         let color = apply_exposure(light, self.renderer.color());
-        if mode == Mode::Color || mode == Mode::Normals {
+        if matches!(shot.mode, Mode::Color | Mode::Normals) {
             return Some((to_rgb(&color), None));
         }
         let alpha = self.renderer.alpha().to_vec();
@@ -254,27 +266,25 @@ impl Painter {
             alpha,
             depth,
         };
-        self.planes_picture(mode, &planes, options.background, size, shot, view)
+        self.planes_picture(shot, &planes, options.background, size)
     }
 
     fn planes_picture(
         &mut self,
-        mode: Mode,
+        shot: &Shot,
         planes: &Planes,
         background: [f32; 3],
-        size: (u32, u32),
-        shot: &Shot,
-        view: Option<&SeenView>,
+        [width, height]: [u32; 2],
     ) -> Option<(Vec<u8>, Option<[f32; 2]>)> {
-        Some(match mode {
+        Some(match shot.mode {
             Mode::Depth => depth_picture(&planes.depth, &planes.alpha),
             Mode::Alpha => {
                 let grey = planes.alpha.iter().map(|a| [to_8_bits(*a); 3]);
                 (grey.flatten().collect(), Some([0.0, 1.0]))
             }
             Mode::Error => {
-                let photo = self.photo(shot.view?, view?)?;
-                let truth = photo.resized(size.0, size.1).over(background);
+                let photo = self.photo(shot.view?)?;
+                let truth = photo.resized(width, height).over(background);
                 error_picture(&planes.color, &truth)
             }
             // A field has no splats: colours are drawn instead of counts and shapes.
@@ -282,18 +292,21 @@ impl Painter {
         })
     }
 
-    /// The photograph of view `index`.
-    fn photo(&mut self, index: usize, view: &SeenView) -> Option<Arc<Photo>> {
+    /// The photograph of view `index`, if there is one.
+    fn photo(&mut self, index: usize) -> Option<Arc<Photo>> {
         if let Some((_, photo)) = self.photo.as_ref().filter(|(kept, _)| *kept == index) {
             return Some(photo.clone());
         }
-        let photo = Arc::new(view.photo.as_ref()?.load().ok()?);
+        let source = self.views.0.get(index)?.photo.as_ref()?;
+        let photo = Arc::new(source.load().ok()?);
         self.photo = Some((index, photo.clone()));
         Some(photo)
     }
 
-    /// PSNR of the scene against the photograph of `view`, in that one's light, dB; `None` without a photograph. `index` is the view's.
-    pub fn score(&mut self, edition: &Edition, index: usize, view: &SeenView) -> Option<f64> {
+    /// PSNR of the scene against the photograph of view `index`, in that one's light, dB; `None` without a photograph.
+    pub fn score(&mut self, edition: &Edition, index: usize) -> Option<f64> {
+        let views = self.views;
+        let view = views.0.get(index)?;
         let scene = edition.scene();
         let photo = view.photo.as_ref()?.load().ok()?;
         let camera = moved_camera(&view.camera, &edition.placement);
@@ -312,18 +325,7 @@ impl Painter {
                 frame.color.to_u8()
             }
         };
-        let (mut sum, mut count) = (0u64, 0u64);
-        for (i, (a, b)) in render.chunks_exact(3).zip(truth.chunks_exact(3)).enumerate() {
-            if mask.as_ref().is_none_or(|mask| mask[i] != 0) {
-                sum += a
-                    .iter()
-                    .zip(b)
-                    .map(|(a, b)| u64::from(a.abs_diff(*b)).pow(2))
-                    .sum::<u64>();
-                count += 3;
-            }
-        }
-        (count > 0).then(|| -10.0 * (sum.max(1) as f64 / (count as f64 * 255.0 * 255.0)).log10())
+        psnr_8_bits(&render, &truth, mask.as_deref())
     }
 
     /// What is at the pixel `(x, y)` of `shot`.
@@ -340,19 +342,18 @@ impl Painter {
         let pixel = Vec2::new(x.floor() + 0.5, y.floor() + 0.5);
         let (depth, splat) = match &scene.model {
             Model::Splats { splats, residual } => {
-                let altered = self.altered(
-                    edition,
+                let whole = ChosenSplats {
+                    part: Part::Level(0),
                     splats,
-                    Part::Level(0),
-                    None,
-                    &Shot {
-                        mode: Mode::Color,
-                        highlight: false,
-                        ..*shot
-                    },
-                    &shot.camera,
-                );
-                let drawn = altered.as_ref().map_or(splats.as_ref(), |(_, splats)| splats);
+                    order: None,
+                };
+                let plain = Shot {
+                    mode: Mode::Color,
+                    highlight: false,
+                    ..*shot
+                };
+                let altered = self.altered(edition, &plain, &whole);
+                let drawn = altered.as_ref().map_or(whole.splats, |(_, splats)| splats);
                 render_splats(
                     drawn,
                     residual.as_deref(),
@@ -397,7 +398,7 @@ fn light_of(edition: &Edition, view: Option<usize>) -> Option<Light<'_>> {
 
 /// `color` `[3, H, W]` in the exposure of `light`.
 fn apply_exposure<'c>(light: Option<Light>, color: &'c [f32]) -> Cow<'c, [f32]> {
-    light.map_or(Cow::Borrowed(color), |light| light.developed(color))
+    light.map_or(Cow::Borrowed(color), |light| light.exposed(color))
 }
 
 fn picked_splat(splats: &Splats, hit: &irradia_splat::render::Hit, of: usize) -> PickedSplat {

@@ -37,13 +37,30 @@ pub(crate) enum Task {
     Score { view: usize },
 }
 
-struct DrawnPicture {
+/// A picture that was drawn, for the page that requested it.
+pub(crate) struct DrawnPicture {
+    /// [`Shot::id`].
+    pub id: u64,
+    /// Version of the scene.
+    pub version: u64,
+    /// How much of it was drawn.
+    pub detail: Detail,
+    /// Number of pixels.
+    pub pixels: f32,
+    /// Time that drawing and encoding took.
+    pub seconds: f32,
+    /// The message to the page.
+    pub bytes: Vec<u8>,
+}
+
+/// The picture that was drawn last for a page.
+struct LastPicture {
     id: u64,
     version: u64,
     detail: Detail,
 }
 
-impl DrawnPicture {
+impl LastPicture {
     /// The share of the pixels that was drawn, if all splats were.
     fn share(&self) -> Option<f32> {
         (self.detail.splats == 1.0).then_some(self.detail.pixels)
@@ -53,7 +70,7 @@ impl DrawnPicture {
 struct Client {
     shot: Option<Shot>,
     shot_at: Instant,
-    drawn: Option<DrawnPicture>,
+    drawn: Option<LastPicture>,
     in_flight: VecDeque<u64>,
     pace: Pace,
     jobs: VecDeque<Task>,
@@ -65,8 +82,8 @@ struct Client {
 #[derive(Default)]
 struct State {
     clients: BTreeMap<u64, Client>,
-    /// Number of clients connected so far, those that have disconnected included.
-    connected: u64,
+    /// The id of the last client that connected; ids count up from 1.
+    last_id: u64,
     /// The client served last.
     served: u64,
     closing: bool,
@@ -102,8 +119,8 @@ impl Scheduler {
         if state.clients.len() >= MAX_CLIENTS || state.closing {
             return None;
         }
-        state.connected += 1;
-        let id = state.connected;
+        state.last_id += 1;
+        let id = state.last_id;
         state.clients.insert(
             id,
             Client {
@@ -188,33 +205,33 @@ impl Scheduler {
         !state.closing && newest.is_some_and(|newest| newest.id == shot.id)
     }
 
-    /// Waits for the next task, clients in turn; `None` when closing. `now` is called again at every wake-up.
-    pub fn next(&self, now: impl Fn() -> SceneStatus) -> Option<(u64, Task)> {
+    /// Waits for the next task, clients in turn; `None` when closing. `status` is called again at every wake-up.
+    pub fn next(&self, status: impl Fn() -> SceneStatus) -> Option<(u64, Task)> {
         let mut state = self.lock();
         loop {
             if state.closing {
                 return None;
             }
-            // Not under the lock of the scheduler: `now` takes other locks.
+            // Not under the lock of the scheduler: `status` takes other locks.
             let wakes = state.wakes;
             drop(state);
-            let at = now();
+            let status = status();
             state = self.lock();
             if state.wakes != wakes {
                 continue;
             }
-            let clock = Instant::now();
+            let now = Instant::now();
             let mut wake_at: Option<Instant> = None;
             let mut sooner = |at: Instant| wake_at = Some(wake_at.map_or(at, |other| other.min(at)));
-            match state.rest_until.filter(|until| at.training && *until > clock) {
+            match state.rest_until.filter(|until| status.training && *until > now) {
                 Some(until) => sooner(until),
                 None => {
                     let after: Vec<u64> = state.clients.range(state.served + 1..).map(|(id, _)| *id).collect();
                     let before: Vec<u64> = state.clients.range(..=state.served).map(|(id, _)| *id).collect();
                     for id in after.into_iter().chain(before) {
-                        let renew_after = state.renew_after.filter(|_| at.training);
+                        let renew_after = state.renew_after.filter(|_| status.training);
                         let client = state.clients.get_mut(&id).expect("listed");
-                        match client.next(at, renew_after, clock) {
+                        match client.next(status, renew_after, now) {
                             Next::Now(task) => {
                                 state.served = id;
                                 return Some((id, *task));
@@ -236,27 +253,17 @@ impl Scheduler {
         }
     }
 
-    /// Delivers a picture drawn in `seconds`.
-    pub fn deliver(
-        &self,
-        client: u64,
-        shot: &Shot,
-        detail: Detail,
-        bytes: Vec<u8>,
-        pixels: f32,
-        seconds: f32,
-        version: u64,
-    ) {
+    /// Delivers a picture to its page.
+    pub fn deliver(&self, client: u64, picture: DrawnPicture) {
+        let DrawnPicture {
+            id, version, detail, ..
+        } = picture;
         self.with_client(client, |client| {
-            client.pace.update(&detail, pixels, seconds);
-            client.drawn = Some(DrawnPicture {
-                id: shot.id,
-                version,
-                detail,
-            });
+            client.pace.update(&detail, picture.pixels, picture.seconds);
+            client.drawn = Some(LastPicture { id, version, detail });
             // The outbox has room for more than the pictures in flight: a full one belongs to a page that is being closed.
-            if client.outbox.try_send(OutMessage::Binary(bytes)).is_ok() {
-                client.in_flight.push_back(shot.id);
+            if client.outbox.try_send(OutMessage::Binary(picture.bytes)).is_ok() {
+                client.in_flight.push_back(id);
             }
         });
     }
@@ -292,11 +299,11 @@ enum Next {
 }
 
 impl Client {
-    fn next(&mut self, now: SceneStatus, renew_after: Option<Instant>, clock: Instant) -> Next {
+    fn next(&mut self, status: SceneStatus, renew_after: Option<Instant>, now: Instant) -> Next {
         if let Some(job) = self.jobs.pop_front() {
             return Next::Now(Box::new(job));
         }
-        let picture = self.picture(now, renew_after, clock);
+        let picture = self.picture(status, renew_after, now);
         if matches!(picture, Next::Now(_)) {
             return picture;
         }
@@ -306,12 +313,12 @@ impl Client {
         // Views are measured only while the camera is at rest, and only while the outbox has room for pictures besides.
         let rests_at = self.shot_at + REST_DELAY;
         let free_at = if self.outbox.capacity() > 2 {
-            clock
+            now
         } else {
-            clock + OUTBOX_POLL_INTERVAL
+            now + OUTBOX_POLL_INTERVAL
         };
         let measured_at = rests_at.max(free_at);
-        if measured_at <= clock {
+        if measured_at <= now {
             self.scores = (view + 1 < count).then_some((view + 1, count));
             return Next::Now(Box::new(Task::Score { view }));
         }
@@ -321,10 +328,10 @@ impl Client {
         }
     }
 
-    fn picture(&self, now: SceneStatus, renew_after: Option<Instant>, clock: Instant) -> Next {
+    fn picture(&self, status: SceneStatus, renew_after: Option<Instant>, now: Instant) -> Next {
         let Some(shot) = self
             .shot
-            .filter(|_| now.version > 0 && self.in_flight.len() < MAX_IN_FLIGHT)
+            .filter(|_| status.version > 0 && self.in_flight.len() < MAX_IN_FLIGHT)
         else {
             return Next::Nothing;
         };
@@ -333,14 +340,14 @@ impl Client {
         let resting = |last| picture(self.pace.resting(&shot, last));
         let rests_at = self.shot_at + REST_DELAY;
         match same {
-            None => picture(self.pace.moving(&shot, now.training)),
-            Some(drawn) if drawn.version != now.version => match renew_after.filter(|after| *after > clock) {
+            None => picture(self.pace.moving(&shot, status.training)),
+            Some(drawn) if drawn.version != status.version => match renew_after.filter(|after| *after > now) {
                 // The camera has just stopped: its picture becomes sharp first.
-                _ if !drawn.detail.sharp && rests_at <= clock => resting(None),
-                Some(after) => Next::At(after.min(rests_at.max(clock))),
+                _ if !drawn.detail.sharp && rests_at <= now => resting(None),
+                Some(after) => Next::At(after.min(rests_at.max(now))),
                 None => resting(drawn.share()),
             },
-            Some(drawn) if !drawn.detail.sharp && rests_at <= clock => resting(drawn.share()),
+            Some(drawn) if !drawn.detail.sharp && rests_at <= now => resting(drawn.share()),
             Some(drawn) if !drawn.detail.sharp => Next::At(rests_at),
             Some(_) => Next::Nothing,
         }
@@ -393,7 +400,15 @@ mod tests {
     }
 
     fn deliver(scheduler: &Scheduler, client: u64, shot: &Shot, detail: Detail) {
-        scheduler.deliver(client, shot, detail, vec![], 1e4, 0.001, 1);
+        let picture = DrawnPicture {
+            id: shot.id,
+            version: 1,
+            detail,
+            pixels: 1e4,
+            seconds: 0.001,
+            bytes: vec![],
+        };
+        scheduler.deliver(client, picture);
     }
 
     #[test]
@@ -403,7 +418,7 @@ mod tests {
         let client = scheduler.connect(outbox).expect("free");
         scheduler.request_picture(client, Some(shot(1)));
         let reads = std::cell::Cell::new(0);
-        let now = || {
+        let status = || {
             // The first version appears just after the state was read without it.
             reads.set(reads.get() + 1);
             if reads.get() == 1 {
@@ -413,7 +428,7 @@ mod tests {
             AT_REST
         };
         close_after(&scheduler, Duration::from_secs(10));
-        assert!(matches!(scheduler.next(now), Some((_, Task::Picture { .. }))));
+        assert!(matches!(scheduler.next(status), Some((_, Task::Picture { .. }))));
     }
 
     #[test]

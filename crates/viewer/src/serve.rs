@@ -196,9 +196,10 @@ async fn splats(State(shared): App) -> Response {
         }
         let scene = edition.scene();
         let order = worker.order(&edition)?;
-        let levels = match order.len() <= MAX_SPLATS_WITH_LEVELS {
-            true => edition.levels.all(),
-            false => &[],
+        let levels = if order.len() <= MAX_SPLATS_WITH_LEVELS {
+            edition.levels.all()
+        } else {
+            &[]
         };
         let bytes = compact_in_order(scene.model.splats()?, scene.options.sh_degree, &order, levels);
         let bytes = Bytes::from(bytes);

@@ -79,9 +79,12 @@ pub fn share(scene: &Scene, output: &Path, options: &ShareOptions) -> Result<Sha
     }
     // Bytes of the page without the splats' own.
     let around = page(scene, options, (!options.folder).then_some(&[])).len() as u64;
-    let cost = |packed: &[u8]| match options.folder {
-        true => around + packed.len() as u64,
-        false => around + (packed.len() as u64).div_ceil(3) * 4,
+    let cost = |packed: &[u8]| {
+        if options.folder {
+            around + packed.len() as u64
+        } else {
+            around + (packed.len() as u64).div_ceil(3) * 4
+        }
     };
     let PackedScene {
         packed,
@@ -226,9 +229,10 @@ fn page(scene: &Scene, options: &ShareOptions, packed: Option<&[u8]>) -> String 
     if let Some(packed) = packed {
         text("text/plain", "splats", &base64::encode(packed));
     }
-    let poster = match options.folder {
-        true => format!("<img class=\"poster\" src=\"{POSTER_FILE}\" alt=\"\">\n"),
-        false => String::new(),
+    let poster = if options.folder {
+        format!("<img class=\"poster\" src=\"{POSTER_FILE}\" alt=\"\">\n")
+    } else {
+        String::new()
     };
     // The texts last, so that no placeholder is searched for in them.
     include_str!("../share/page.html")

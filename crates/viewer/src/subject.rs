@@ -8,8 +8,8 @@ use crate::views::Views;
 use irradia_edit::Transform;
 use irradia_runs::formats::Lenses;
 use irradia_runs::{
-    Reading, Run, RunFolder, Scene, Snapshot, TrainInput, is_moved, moved_from_run, read_levels, read_lights,
-    scene_path,
+    Reading, ReadingOptions, Run, RunFolder, Scene, Snapshot, TrainInput, is_moved, moved_from_run, read_levels,
+    read_lights, scene_path,
 };
 use irradia_scene::Dataset;
 use irradia_splat::Splats;
@@ -105,18 +105,19 @@ pub struct Subject {
 
 impl Subject {
     /// Reads the run, the scene or the dataset at `path`. Photographs come from `data`, else from the dataset of the run; a dataset
-    /// itself is shown by its points.
+    /// itself is shown by its points. What `reading` leaves out follows from the run, if its dataset is read, or is the default.
     ///
     /// # Errors
     /// When there is nothing to show, or it cannot be read.
-    pub fn open(path: &Path, data: Option<&Path>, reading: &Reading) -> Result<Self, ViewerError> {
+    pub fn open(path: &Path, data: Option<&Path>, reading: &ReadingOptions) -> Result<Self, ViewerError> {
         let folder = RunFolder::containing(path);
         let file = scene_path(path);
         if file.is_dir() {
             if folder.is_some() {
                 return Err(ViewerError::Unfinished { path: path.to_owned() });
             }
-            return Ok(Self::of_dataset(path, reading.read(path)?));
+            let dataset = reading.with_fallback(Reading::default()).read(path)?;
+            return Ok(Self::of_dataset(path, dataset));
         }
         let recipe = folder
             .as_ref()
@@ -126,7 +127,7 @@ impl Subject {
         let mut scene = Scene::read(&file)?;
         let mut warnings = std::mem::take(&mut scene.notes);
         let dataset = match (data, &folder) {
-            (Some(data), _) => Some(reading.read(data)?),
+            (Some(data), _) => Some(reading.with_fallback(Reading::default()).read(data)?),
             // A run's photographs may have been moved: its scene can be viewed without them.
             (None, Some(folder)) => TrainInput::of_run(folder.path())
                 .and_then(|mut input| {

@@ -28,17 +28,13 @@ pub struct Viewer {
 }
 
 impl Viewer {
-    /// Serves `subject`. `tell` receives lines for the user of the program, such as each kind of refused request once.
+    /// Serves `subject`. `sink` receives lines for the user of the program, such as each kind of refused request once.
     ///
     /// # Errors
     /// When no address can be listened on, or the system refuses threads or random numbers.
-    pub fn start(
-        subject: Subject,
-        listen: &Listen,
-        tell: Box<dyn Fn(&str) + Send + Sync>,
-    ) -> Result<Self, ViewerError> {
+    pub fn start(subject: Subject, listen: &Listen, sink: LineSink) -> Result<Self, ViewerError> {
         let refused = |error: io::Error| ViewerError::Start(error.to_string());
-        let notices = Arc::new(Notices::new(tell as LineSink));
+        let notices = Arc::new(Notices::new(sink));
         let listener = listen.bind()?;
         let bound = listener.local_addr().map_err(refused)?;
         let token = if bound.ip().is_loopback() {

@@ -110,15 +110,16 @@ impl Array {
     /// When it cannot; the error contains the device's limit.
     pub fn check(gpu: &Gpu, label: &'static str, words: usize) -> Result<(), DeviceError> {
         let (needed, limit) = (4 * words as u64, gpu.info.largest_array);
-        match needed <= limit {
-            true => Ok(()),
-            false => Err(DeviceError::TooLarge {
+        if needed <= limit {
+            Ok(())
+        } else {
+            Err(DeviceError::TooLarge {
                 name: gpu.info.name.clone(),
                 label,
                 needed: needed.div_ceil(1_000_000),
                 limit: limit / 1_000_000,
                 fitting: None,
-            }),
+            })
         }
     }
 

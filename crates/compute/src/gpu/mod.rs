@@ -160,9 +160,10 @@ fn describe(adapter: &wgpu::Adapter) -> AdapterInfo {
         driver: format!("{} {}", info.driver, info.driver_info).trim().to_owned(),
         largest_array: limits.max_storage_buffer_binding_size.min(limits.max_buffer_size),
         shared_memory: limits.max_compute_workgroup_storage_size,
-        subgroup: match has_subgroups {
-            true => [info.subgroup_min_size, info.subgroup_max_size],
-            false => [0; 2],
+        subgroup: if has_subgroups {
+            [info.subgroup_min_size, info.subgroup_max_size]
+        } else {
+            [0; 2]
         },
         is_usable: limits.max_storage_buffers_per_shader_stage >= MAX_BINDINGS
             && limits.max_compute_invocations_per_workgroup >= WORKGROUP_SIZE

@@ -33,9 +33,10 @@ pub(crate) fn select_among(
 ) -> Result<Selection, EditError> {
     steps.iter().try_for_each(SelectStep::check)?;
     let begins_full = steps.first().is_some_and(|step| step.mode != Mode::Add);
-    let mut selected = match begins_full {
-        true => Selection::all(draft.len()),
-        false => Selection::none(draft.len()),
+    let mut selected = if begins_full {
+        Selection::all(draft.len())
+    } else {
+        Selection::none(draft.len())
     };
     for step in steps {
         match &step.shape {

@@ -68,6 +68,17 @@ impl HashGrid {
     }
 }
 
+/// Panels of points, and where one level's features are among those of all levels.
+#[derive(Clone, Copy, Debug)]
+pub struct LevelPanels<'a, T> {
+    /// `[panels, 3, 32]` points in \[0, 1\]; others are clamped.
+    pub points: &'a [T],
+    /// First row of the level's features, or of their gradients.
+    pub row: usize,
+    /// Rows of each panel, those of all levels.
+    pub rows: usize,
+}
+
 /// The eight corners around each sample of a panel: entry indices and weights.
 struct Corners<T> {
     index: [[u32; PANEL]; 8],
@@ -78,7 +89,7 @@ struct Corners<T> {
 const PRIMES: [u32; 2] = [2_654_435_761, 805_459_861];
 
 #[inline(always)]
-fn corners<S: Simd>(simd: S, level: &GridLevel, points: &[Num<S>], out: &mut Corners<Num<S>>) {
+fn find_corners<S: Simd>(simd: S, level: &GridLevel, points: &[Num<S>], out: &mut Corners<Num<S>>) {
     let mut whole = [[0u32; PANEL]; 3];
     let (zero, one) = (simd.splat(0.0), simd.splat(1.0));
     let cells = simd.splat(f64::from(level.cells));
@@ -140,24 +151,21 @@ impl<T: Scalar> Corners<T> {
     }
 }
 
-/// Encodes panels of points at one level: `points [panels, 3, 32]` in \[0, 1\] (clamped) to rows `row..row + F` of
-/// `to [panels, rows, 32]`.
+/// Encodes panels of points at one level, to rows `row..row + F` of `to [panels, rows, 32]`.
 #[inline(always)]
 pub fn encode_level<S: Simd>(
     simd: S,
     grid: &HashGrid,
     level: &GridLevel,
     table: &[Num<S>],
-    points: &[Num<S>],
-    row: usize,
-    rows: usize,
+    panels: LevelPanels<'_, Num<S>>,
     to: &mut [Num<S>],
 ) {
     match grid.features {
-        1 => encode_features::<S, 1>(simd, level, table, points, row, rows, to),
-        2 => encode_features::<S, 2>(simd, level, table, points, row, rows, to),
-        4 => encode_features::<S, 4>(simd, level, table, points, row, rows, to),
-        _ => encode_features::<S, 8>(simd, level, table, points, row, rows, to),
+        1 => encode_features::<S, 1>(simd, level, table, panels, to),
+        2 => encode_features::<S, 2>(simd, level, table, panels, to),
+        4 => encode_features::<S, 4>(simd, level, table, panels, to),
+        _ => encode_features::<S, 8>(simd, level, table, panels, to),
     }
 }
 
@@ -166,21 +174,20 @@ fn encode_features<S: Simd, const F: usize>(
     simd: S,
     level: &GridLevel,
     table: &[Num<S>],
-    points: &[Num<S>],
-    row: usize,
-    rows: usize,
+    panels: LevelPanels<'_, Num<S>>,
     to: &mut [Num<S>],
 ) {
+    let LevelPanels { points, row, rows } = panels;
     let table = &table.as_chunks::<F>().0[level.first..level.first + level.entries];
-    let mut at = Corners::new();
+    let mut corners = Corners::new();
     for (points, to) in points.chunks_exact(3 * PANEL).zip(to.chunks_exact_mut(rows * PANEL)) {
-        corners(simd, level, points, &mut at);
+        find_corners(simd, level, points, &mut corners);
         let to = &mut to.as_chunks_mut::<PANEL>().0[row..row + F];
         for s in 0..PANEL {
             let mut sum = [Num::<S>::default(); F];
             for k in 0..8 {
-                let entry = &table[at.index[k][s] as usize];
-                let weight = at.weight[k][s];
+                let entry = &table[corners.index[k][s] as usize];
+                let weight = corners.weight[k][s];
                 for f in 0..F {
                     sum[f] = sum[f] + entry[f] * weight;
                 }
@@ -200,17 +207,15 @@ pub fn encode_level_vjp<S: Simd>(
     simd: S,
     grid: &HashGrid,
     level: &GridLevel,
-    points: &[Num<S>],
+    panels: LevelPanels<'_, Num<S>>,
     v: &[Num<S>],
-    row: usize,
-    rows: usize,
     grads: &mut [Num<S>],
 ) {
     match grid.features {
-        1 => features_vjp::<S, 1>(simd, level, points, v, row, rows, grads),
-        2 => features_vjp::<S, 2>(simd, level, points, v, row, rows, grads),
-        4 => features_vjp::<S, 4>(simd, level, points, v, row, rows, grads),
-        _ => features_vjp::<S, 8>(simd, level, points, v, row, rows, grads),
+        1 => features_vjp::<S, 1>(simd, level, panels, v, grads),
+        2 => features_vjp::<S, 2>(simd, level, panels, v, grads),
+        4 => features_vjp::<S, 4>(simd, level, panels, v, grads),
+        _ => features_vjp::<S, 8>(simd, level, panels, v, grads),
     }
 }
 
@@ -218,16 +223,15 @@ pub fn encode_level_vjp<S: Simd>(
 fn features_vjp<S: Simd, const F: usize>(
     simd: S,
     level: &GridLevel,
-    points: &[Num<S>],
+    panels: LevelPanels<'_, Num<S>>,
     v: &[Num<S>],
-    row: usize,
-    rows: usize,
     grads: &mut [Num<S>],
 ) {
+    let LevelPanels { points, row, rows } = panels;
     let grads = &mut grads.as_chunks_mut::<F>().0[..level.entries];
-    let mut at = Corners::new();
+    let mut corners = Corners::new();
     for (points, v) in points.chunks_exact(3 * PANEL).zip(v.chunks_exact(rows * PANEL)) {
-        corners(simd, level, points, &mut at);
+        find_corners(simd, level, points, &mut corners);
         let v = &v.as_chunks::<PANEL>().0[row..row + F];
         for s in 0..PANEL {
             let mut g = [Num::<S>::default(); F];
@@ -238,8 +242,8 @@ fn features_vjp<S: Simd, const F: usize>(
                 continue;
             }
             for k in 0..8 {
-                let entry = &mut grads[at.index[k][s] as usize];
-                let weight = at.weight[k][s];
+                let entry = &mut grads[corners.index[k][s] as usize];
+                let weight = corners.weight[k][s];
                 for f in 0..F {
                     entry[f] = entry[f] + g[f] * weight;
                 }
@@ -255,26 +259,25 @@ pub fn encode_level_point_vjp<S: Simd>(
     grid: &HashGrid,
     level: &GridLevel,
     table: &[Num<S>],
-    points: &[Num<S>],
+    panels: LevelPanels<'_, Num<S>>,
     v: &[Num<S>],
-    row: usize,
-    rows: usize,
     v_points: &mut [Num<S>],
 ) {
+    let LevelPanels { points, row, rows } = panels;
     let features = grid.features;
     let table = &table[level.first * features..(level.first + level.entries) * features];
     let cells = simd.splat(f64::from(level.cells));
     let (zero, one) = (simd.splat(0.0), simd.splat(1.0));
     let last = simd.splat(f64::from(level.cells - 1));
-    let mut at = Corners::new();
+    let mut corners = Corners::new();
     let panels = points.chunks_exact(3 * PANEL).zip(v.chunks_exact(rows * PANEL));
     for ((points, v), v_points) in panels.zip(v_points.chunks_exact_mut(3 * PANEL)) {
-        corners(simd, level, points, &mut at);
+        find_corners(simd, level, points, &mut corners);
         // The gradient of each corner's weight.
         let mut v_weight = [[Num::<S>::default(); PANEL]; 8];
         for k in 0..8 {
             for s in 0..PANEL {
-                let entry = &table[at.index[k][s] as usize * features..][..features];
+                let entry = &table[corners.index[k][s] as usize * features..][..features];
                 for f in 0..features {
                     v_weight[k][s] = v_weight[k][s] + entry[f] * v[(row + f) * PANEL + s];
                 }

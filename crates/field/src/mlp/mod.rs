@@ -16,7 +16,7 @@ use product::{Begin, Finish, pack, product};
 
 /// Samples per panel.
 pub const PANEL: usize = 32;
-/// Widths are padded to a multiple of this.
+/// Rows of features in a tile of weights or of sums. Widths are padded to whole tiles.
 pub const TILE_ROWS: usize = 8;
 
 /// The sizes of a network.

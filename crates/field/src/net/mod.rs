@@ -3,7 +3,7 @@
 //! A block of samples is evaluated in three steps, so that occluded samples can be dropped between them:
 //! [`Net::density`], [`Block::keep`], [`Net::color`]; then [`Net::backward`].
 
-use crate::encoding::hash_grid::{GridLevel, encode_level, encode_level_point_vjp, encode_level_vjp};
+use crate::encoding::hash_grid::{GridLevel, LevelPanels, encode_level, encode_level_point_vjp, encode_level_vjp};
 use crate::encoding::{DirectionEncoding, PositionEncoding};
 use crate::mlp::{Mlp, MlpShape, PANEL};
 use crate::{Num, Rows};
@@ -215,8 +215,12 @@ impl Net {
         match &self.shape.encoding {
             PositionEncoding::HashGrid(grid) => {
                 for (l, level) in self.levels.iter().enumerate() {
-                    let row = l * grid.features;
-                    encode_level(simd, grid, level, table, &block.points, row, rows, &mut block.encoded);
+                    let panels = LevelPanels {
+                        points: &block.points,
+                        row: l * grid.features,
+                        rows,
+                    };
+                    encode_level(simd, grid, level, table, panels, &mut block.encoded);
                 }
             }
             PositionEncoding::Frequency(frequency) => {
@@ -388,8 +392,12 @@ impl Net {
         };
         for (l, level) in self.levels.iter().enumerate() {
             let grads = &mut grads[level.first * grid.features..];
-            let (row, rows) = (l * grid.features, self.encoded_rows());
-            encode_level_vjp(simd, grid, level, points, v_encoded, row, rows, grads);
+            let panels = LevelPanels {
+                points,
+                row: l * grid.features,
+                rows: self.encoded_rows(),
+            };
+            encode_level_vjp(simd, grid, level, panels, v_encoded, grads);
         }
     }
 
@@ -431,8 +439,12 @@ impl Net {
         match &self.shape.encoding {
             PositionEncoding::HashGrid(grid) => {
                 for (l, level) in self.levels.iter().enumerate() {
-                    let (points, v) = (&block.points, &block.v_encoded);
-                    encode_level_point_vjp(simd, grid, level, table, points, v, l * grid.features, rows, v_points);
+                    let panels = LevelPanels {
+                        points: &block.points,
+                        row: l * grid.features,
+                        rows,
+                    };
+                    encode_level_point_vjp(simd, grid, level, table, panels, &block.v_encoded, v_points);
                 }
             }
             PositionEncoding::Frequency(frequency) => {

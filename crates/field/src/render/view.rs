@@ -98,7 +98,7 @@ fn pixel(field: &Field, pass: &Pass, r: usize, (ray, cosine): &(Ray, f32), optio
     let depth_at = |i: usize| cosine * ray.world_distance(pass.middles[i]);
     let mut depth = 0.0;
     let mut normal = Vec3::ZERO;
-    for i in pass.of(r) {
+    for i in pass.samples_of(r) {
         depth += pass.weights[i] * depth_at(i);
         if options.normals {
             let slope = field.space.unit_vjp(ray.at(pass.middles[i]), get3(&pass.slopes, i));

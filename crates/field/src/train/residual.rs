@@ -6,7 +6,7 @@ use super::{GROUPS, StepOptions, add_up, descend};
 use crate::field::Field;
 use crate::mlp::PANEL;
 use crate::net::{NetParameters, set3};
-use crate::pass::{Colors, Density};
+use crate::pass::{Colors, DensitiesAtPoints};
 use crate::query::{color_at, units};
 use crate::state::FieldState;
 use irradia_compute::Level;
@@ -100,7 +100,7 @@ impl Worker {
             set3(&mut block.v_rgb, i, v_added.map(|v| 2.0 * v)); // The slope of [`residual_of`].
         }
         block.fill_code(&field.code(image));
-        level.run(Density { net, parameters, block });
+        level.run(DensitiesAtPoints { net, parameters, block });
         level.run(Colors { net, parameters, block });
         level.run(Backward {
             net,

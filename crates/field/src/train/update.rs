@@ -2,7 +2,7 @@
 
 use super::{Scratch, StepOptions};
 use crate::encoding::PositionEncoding;
-use crate::encoding::hash_grid::{GridLevel, HashGrid, encode_level_vjp};
+use crate::encoding::hash_grid::{GridLevel, HashGrid, LevelPanels, encode_level_vjp};
 use crate::optimise::Adam;
 use crate::state::FieldState;
 use irradia_compute::Level;
@@ -56,10 +56,12 @@ pub(super) fn update(
                         level.run(Scatter {
                             grid,
                             level: at,
-                            points,
+                            panels: LevelPanels {
+                                points,
+                                row: l * grid.features,
+                                rows: net.encoded_rows(),
+                            },
                             v,
-                            row: l * grid.features,
-                            rows: net.encoded_rows(),
                             grads: gradients,
                         });
                     }
@@ -119,10 +121,8 @@ pub(super) fn update(
 struct Scatter<'a> {
     grid: &'a HashGrid,
     level: &'a GridLevel,
-    points: &'a [f32],
+    panels: LevelPanels<'a, f32>,
     v: &'a [f32],
-    row: usize,
-    rows: usize,
     grads: &'a mut [f32],
 }
 
@@ -134,15 +134,6 @@ impl Kernel for Scatter<'_> {
     where
         S::F: Lanes<Scalar = f32>,
     {
-        encode_level_vjp(
-            simd,
-            self.grid,
-            self.level,
-            self.points,
-            self.v,
-            self.row,
-            self.rows,
-            self.grads,
-        );
+        encode_level_vjp(simd, self.grid, self.level, self.panels, self.v, self.grads);
     }
 }

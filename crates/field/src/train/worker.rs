@@ -135,7 +135,7 @@ impl Worker {
         pass.block.v_rgb.clear();
         pass.block.v_rgb.resize(3 * padded, 0.0);
         for (r, ray) in range.clone().enumerate() {
-            let samples = pass.of(r);
+            let samples = pass.samples_of(r);
             if with_color {
                 let Score {
                     squares,
@@ -172,7 +172,7 @@ impl Worker {
                 self.loss.total += f64::from(loss / ray_weight);
             }
             if let (false, Some(fine)) = (last, later.last()) {
-                let of = fine.of(r);
+                let of = fine.samples_of(r);
                 let stride = count_of(field.nets.len() - 1) + 1;
                 let fine_edges = &fine.edges[r * stride..][..of.len() + 1];
                 let scale = task.options.interlevel * ray_weight;
@@ -186,7 +186,7 @@ impl Worker {
             self.loss.samples += n;
         }
         for r in 0..range.len() {
-            let samples = pass.of(r);
+            let samples = pass.samples_of(r);
             let (interval_transmittances, weights) = (
                 &pass.interval_transmittances[samples.clone()],
                 &pass.weights[samples.clone()],
@@ -210,7 +210,7 @@ impl Worker {
         });
         let size = if with_color { field.config.appearance() } else { 0 };
         for (r, ray) in range.enumerate() {
-            for i in pass.of(r) {
+            for i in pass.samples_of(r) {
                 for k in 0..size {
                     let at = batch.images[ray] as usize * size + k;
                     if let Some(to) = self.codes.get_mut(at) {

@@ -73,9 +73,10 @@ pub(super) fn is_in(path: &Path) -> bool {
 pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, FormatError> {
     let dataset = read_and_parse(&path.join("dataset.json"), parse_nerfies_dataset)?;
     let file = path.join("metadata.json");
-    let metadata: HashMap<String, NerfiesMetadata> = match file.is_file() {
-        true => read_and_parse(&file, |bytes| parse_json(bytes, "metadata"))?,
-        false => HashMap::new(),
+    let metadata: HashMap<String, NerfiesMetadata> = if file.is_file() {
+        read_and_parse(&file, |bytes| parse_json(bytes, "metadata"))?
+    } else {
+        HashMap::new()
     };
     let folder = |factor: u32| path.join(format!("rgb/{factor}x"));
     let exact = DOWNSCALE_FACTORS

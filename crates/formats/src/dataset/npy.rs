@@ -85,9 +85,10 @@ pub(crate) fn parse_table(bytes: &[u8]) -> Result<Table, Malformed> {
 fn header_value<'a>(header: &'a str, key: &str) -> Option<&'a str> {
     let start = header.find(&format!("'{key}'"))? + key.len() + 2;
     let text = header[start..].trim_start().strip_prefix(':')?.trim_start();
-    let end = match text.starts_with('(') {
-        true => text.find(')')? + 1,
-        false => text.find([',', '}'])?,
+    let end = if text.starts_with('(') {
+        text.find(')')? + 1
+    } else {
+        text.find([',', '}'])?
     };
     Some(text[..end].trim())
 }

@@ -182,18 +182,32 @@ mod tests {
     }
 
     #[test]
-    fn damaged_blocks_are_no_trouble() {
+    fn a_truncated_block_has_no_tags_and_a_damaged_one_no_impossible_focal_length() {
         let whole = block(&[
             (Tag::Model, Value::Ascii(vec![b"One".to_vec()])),
-            (Tag::FocalLength, ratio(4, 1)),
+            (Tag::FocalLength, ratio(6, 1)),
+            (Tag::FocalPlaneXResolution, ratio(2000, 1)),
+            (Tag::FocalPlaneResolutionUnit, Value::Short(vec![3])),
         ]);
+        let size = [4000, 3000];
+        let expected = CameraTags {
+            model: Some("One".to_owned()),
+            focal: Some(0.3),
+            ..CameraTags::default()
+        };
+        assert_eq!(parse_camera_tags(&whole, size), expected);
         for length in 0..whole.len() {
-            parse_camera_tags(&whole[..length], [10, 10]);
+            let tags = parse_camera_tags(&whole[..length], size);
+            assert_eq!(tags, CameraTags::default(), "{length} of {} bytes", whole.len());
         }
         for i in 0..whole.len() {
             let mut bytes = whole.clone();
             bytes[i] ^= 0xff;
-            parse_camera_tags(&bytes, [10, 10]);
+            let focal = parse_camera_tags(&bytes, size).focal;
+            assert!(
+                focal.is_none_or(|focal| (0.1..50.0).contains(&focal)),
+                "byte {i}: {focal:?}"
+            );
         }
     }
 }

@@ -371,9 +371,10 @@ impl Buckets {
         let (mut full, mut partial) = (Vec::new(), Vec::new());
         for (block, splats) in &blocks {
             for bucket in splats.chunks(BUCKET_SIZE) {
-                match bucket.len() == BUCKET_SIZE {
-                    true => full.push((block, bucket)),
-                    false => partial.push((block, bucket)),
+                if bucket.len() == BUCKET_SIZE {
+                    full.push((block, bucket));
+                } else {
+                    partial.push((block, bucket));
                 }
             }
         }

@@ -287,9 +287,10 @@ pub fn read_splat_file(path: &Path) -> Result<SplatFile, FormatError> {
     let mut cloud = match format {
         SplatFormat::Ply | SplatFormat::CompressedPly | SplatFormat::PointsPly => read_and_parse(path, |bytes| {
             unread = ply::unread_properties(bytes);
-            format = match ply::is_compressed(bytes) {
-                true => SplatFormat::CompressedPly,
-                false => SplatFormat::Ply,
+            format = if ply::is_compressed(bytes) {
+                SplatFormat::CompressedPly
+            } else {
+                SplatFormat::Ply
             };
             parse(format, bytes)
         })?,
@@ -345,9 +346,10 @@ pub fn parse_splats(format: SplatFormat, bytes: &[u8]) -> Result<GaussianCloud, 
 /// When the cloud's columns have unequal lengths: a bug in the caller.
 pub fn encode_splats(format: SplatFormat, cloud: &GaussianCloud, options: &WriteOptions) -> io::Result<Vec<u8>> {
     assert!(cloud.is_consistent(), "the columns of the cloud have unequal lengths");
-    let prepared = match format.holds_all() {
-        true => Cow::Borrowed(cloud),
-        false => prepare_export(cloud, &mut Vec::new()),
+    let prepared = if format.holds_all() {
+        Cow::Borrowed(cloud)
+    } else {
+        prepare_export(cloud, &mut Vec::new())
     };
     let mut bytes = Vec::new();
     encode(format, &mut bytes, &prepared, options)?;
@@ -387,9 +389,10 @@ pub fn is_sog_folder(path: &Path) -> bool {
 
 /// The `meta.json` that `path` is or contains.
 fn sog_meta(path: &Path) -> PathBuf {
-    match path.is_dir() {
-        true => path.join(sog::META_FILE),
-        false => path.to_owned(),
+    if path.is_dir() {
+        path.join(sog::META_FILE)
+    } else {
+        path.to_owned()
     }
 }
 
@@ -458,9 +461,10 @@ pub fn write_splats_with(
     assert!(cloud.is_consistent(), "the columns of the cloud have unequal lengths");
     let format = SplatFormat::of(path)?;
     let mut notes = Vec::new();
-    let cloud = match format.holds_all() {
-        true => Cow::Borrowed(cloud),
-        false => prepare_export(cloud, &mut notes),
+    let cloud = if format.holds_all() {
+        Cow::Borrowed(cloud)
+    } else {
+        prepare_export(cloud, &mut notes)
     };
     if cloud.sh_degree > format.max_degree() {
         notes.push(format!(
@@ -522,9 +526,10 @@ fn exceeds_f32_precision(cloud: &GaussianCloud) -> bool {
         .filter(|distance| distance.is_finite())
         .collect();
     let middle = distances.len() / 2;
-    let median = match distances.is_empty() {
-        true => 0.0,
-        false => *distances.select_nth_unstable_by(middle, f32::total_cmp).1,
+    let median = if distances.is_empty() {
+        0.0
+    } else {
+        *distances.select_nth_unstable_by(middle, f32::total_cmp).1
     };
     world.center.length() > 200.0 * f64::from(median) / world.scale
 }

@@ -56,9 +56,10 @@ pub(crate) fn dc_of_byte(color: u8) -> f32 {
 /// The quaternion at length 1; one of zero or infinite length becomes the identity.
 pub(crate) fn normalized(quat: [f32; 4]) -> [f32; 4] {
     let length = quat.iter().map(|v| v * v).sum::<f32>().sqrt();
-    match length > 0.0 && length.is_finite() {
-        true => quat.map(|v| v / length),
-        false => [1.0, 0.0, 0.0, 0.0],
+    if length > 0.0 && length.is_finite() {
+        quat.map(|v| v / length)
+    } else {
+        [1.0, 0.0, 0.0, 0.0]
     }
 }
 

@@ -8,6 +8,7 @@ use irradia_compute::Level;
 use irradia_compute::simd::{Kernel, Lanes, Simd};
 use irradia_field::Rows;
 use irradia_field::encoding::HashGrid;
+use irradia_field::encoding::hash_grid::{LevelPanels, encode_level, encode_level_vjp};
 use irradia_field::mlp::{Mlp, MlpShape, MlpTape, PANEL};
 use irradia_scene::Rng;
 
@@ -204,17 +205,12 @@ impl Kernel for Encode<'_> {
     {
         let rows = self.grid.levels * self.grid.features;
         for (l, level) in self.grid.level_table().iter().enumerate() {
-            let row = l * self.grid.features;
-            irradia_field::encoding::hash_grid::encode_level(
-                simd,
-                self.grid,
-                level,
-                self.table,
-                self.points,
-                row,
+            let panels = LevelPanels {
+                points: self.points,
+                row: l * self.grid.features,
                 rows,
-                self.to,
-            );
+            };
+            encode_level(simd, self.grid, level, self.table, panels, self.to);
         }
     }
 }
@@ -236,18 +232,13 @@ impl Kernel for Scatter<'_> {
     {
         let rows = self.grid.levels * self.grid.features;
         for (l, level) in self.grid.level_table().iter().enumerate() {
-            let row = l * self.grid.features;
-            let grads = &mut self.grads[level.first * self.grid.features..];
-            irradia_field::encoding::hash_grid::encode_level_vjp(
-                simd,
-                self.grid,
-                level,
-                self.points,
-                self.v,
-                row,
+            let panels = LevelPanels {
+                points: self.points,
+                row: l * self.grid.features,
                 rows,
-                grads,
-            );
+            };
+            let grads = &mut self.grads[level.first * self.grid.features..];
+            encode_level_vjp(simd, self.grid, level, panels, self.v, grads);
         }
     }
 }

@@ -117,7 +117,7 @@ fn report_parts(what: &str, splats: &Splats, views: &[ViewParams], options: &Ren
     for view in views {
         renderer.render(splats, view, options);
         pairs += renderer.pairs();
-        entries += renderer.tile_entries();
+        entries += renderer.intersections();
     }
     let forward = time(3, || {
         views.iter().for_each(|view| renderer.render(splats, view, options))
@@ -230,7 +230,7 @@ fn frame(scene: &str) -> Result<()> {
             view.width,
             view.height,
             renderer.pairs() as f64 / 1e6,
-            renderer.tile_entries() as f64 / 1e3,
+            renderer.intersections() as f64 / 1e3,
         );
     };
     let view = camera(1280, 720);

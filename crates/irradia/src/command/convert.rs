@@ -109,12 +109,11 @@ fn lines(conversion: &Conversion) -> String {
         let error = psnr.iter().map(|db| 10f64.powf(-0.1 * db)).sum::<f64>() / psnr.len() as f64;
         let mean = -10.0 * error.log10();
         let worst = psnr.iter().copied().fold(f64::INFINITY, f64::min);
-        text += &match worst.is_finite() {
-            true => format!(
-                "\n  PSNR           {mean:.2} dB, worst {worst:.2} dB, of {} views around it",
-                psnr.len()
-            ),
-            false => format!("\n  PSNR           all {} views around it are identical", psnr.len()),
+        let views = psnr.len();
+        text += &if worst.is_finite() {
+            format!("\n  PSNR           {mean:.2} dB, worst {worst:.2} dB, of {views} views around it")
+        } else {
+            format!("\n  PSNR           all {views} views around it are identical")
         };
     }
     text + &note_lines(&conversion.notes)

@@ -122,9 +122,10 @@ pub fn pose_first(input: &mut TrainInput, poses: Poses, anyway: bool) -> Result<
             .collect();
         let first = reasons.first().map_or(String::new(), |first| format!(" {first};"));
         let doctor = posed.join("doctor.html");
-        let see = match doctor.exists() {
-            true => format!(" see {};", doctor.display()),
-            false => String::new(),
+        let see = if doctor.exists() {
+            format!(" see {};", doctor.display())
+        } else {
+            String::new()
         };
         // Poses by COLMAP would be compared with the photographs first.
         let given = if poses == Poses::Colmap { " --poses given" } else { "" };

@@ -61,9 +61,10 @@ fn flight(path: &Path, source: &Path, scene: &Scene) -> Result<Film> {
     if path.as_os_str() != "training" && !path.is_file() {
         film.cameras.extend(film.cameras.first().copied());
     }
-    match film.cameras.is_empty() {
-        true => Err(Usage("the path is empty".into()).into()),
-        false => Ok(film),
+    if film.cameras.is_empty() {
+        Err(Usage("the path is empty".into()).into())
+    } else {
+        Ok(film)
     }
 }
 

@@ -63,7 +63,7 @@ impl ListenArgs {
 pub fn run(args: &Args) -> Result<()> {
     use_threads(args.threads)?;
     let stop = stop_flag();
-    let subject = Subject::open(&args.path, args.data.as_deref(), &args.reading.reading())?;
+    let subject = Subject::open(&args.path, args.data.as_deref(), &args.reading.options())?;
     let viewer = args.listen.start(subject)?;
     note("press Ctrl-C to stop");
     viewer.wait(&|| stop.load(Ordering::Relaxed));

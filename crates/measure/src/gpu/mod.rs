@@ -156,9 +156,10 @@ impl GpuLoss {
         self.samples.reserve(gpu, samples.len());
         self.samples.write(gpu, 0, &samples);
         // With nothing to compare, gradients are zero.
-        let gains = match count > 0.0 {
-            true => Gains::of(weights, count),
-            false => Gains::NONE,
+        let gains = if count > 0.0 {
+            Gains::of(weights, count)
+        } else {
+            Gains::NONE
         };
         let gains = [gains.l1 as f32, gains.ssim as f32, gains.mse as f32, extra.depth_weight].map(f32::to_bits);
         let sizes = [
@@ -274,7 +275,7 @@ fn write_bytes(gpu: &Gpu, to: &mut Array, bytes: &[u8]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{DepthKind, DepthLoss, PhotometricLoss};
+    use crate::{DepthGradient, DepthKind, DepthLoss, DepthPlanes, PhotometricLoss};
     use irradia_compute::gpu::Wanted;
     use irradia_scene::Rng;
 
@@ -329,15 +330,16 @@ mod tests {
                 let values = PhotometricLoss::new().evaluate(&planes[..3 * pixels], &target, &weights, v_color);
                 let (v_alpha, rest) = rest.split_at_mut(pixels);
                 let (v_depth, errors) = rest.split_at_mut(pixels);
-                let depth = DepthLoss::default().evaluate(
-                    &planes[4 * pixels..],
-                    &planes[3 * pixels..4 * pixels],
-                    &samples,
-                    DepthKind::Metric,
-                    0.7,
-                    v_depth,
-                    v_alpha,
-                );
+                let depth_planes = DepthPlanes {
+                    depth: &planes[4 * pixels..],
+                    alpha: &planes[3 * pixels..4 * pixels],
+                };
+                let mut gradient = DepthGradient {
+                    depth: &mut *v_depth,
+                    alpha: &mut *v_alpha,
+                };
+                let metric = DepthKind::Metric;
+                let depth = DepthLoss::default().evaluate(depth_planes, &samples, metric, 0.7, &mut gradient);
                 for (i, v) in v_alpha.iter_mut().enumerate() {
                     *v -= 0.3 / pixels as f32 * mask.map_or(1.0, |mask| f32::from(mask[i]) / 255.0);
                 }

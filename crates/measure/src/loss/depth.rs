@@ -13,6 +13,7 @@
 //! by the mean of D removes the gain from shrinking the scene. The gradient includes the fit and that mean. Depths whose fit would
 //! invert them (a <= 0) have no loss: with a = 0 it would pull the whole view to one depth.
 
+use super::{DepthGradient, DepthPlanes};
 use irradia_compute::simd::Scalar;
 
 /// The known depth of one pixel.
@@ -77,42 +78,35 @@ struct Counted {
 }
 
 impl DepthLoss {
-    /// The loss of the accumulated `depth [H * W]` and `alpha [H * W]`; `weight` times the gradients is added to `v_depth` and
-    /// `v_alpha`, of the same shape. Samples beyond the image do not count.
+    /// The loss of `frame`; `weight` times its gradient is added to `gradient`. Samples beyond the image do not count.
     ///
     /// # Panics
     /// When the lengths differ: a bug in the caller.
     pub fn evaluate(
         &mut self,
-        depth: &[f32],
-        alpha: &[f32],
+        frame: DepthPlanes,
         samples: &[DepthSample],
         kind: DepthKind,
         weight: f32,
-        v_depth: &mut [f32],
-        v_alpha: &mut [f32],
+        gradient: &mut DepthGradient,
     ) -> DepthValues {
-        self.run(depth, alpha, samples, kind, f64::from(weight), v_depth, v_alpha)
+        self.run(frame, samples, kind, f64::from(weight), gradient)
     }
 
     // Single-threaded: a view has a few thousand samples, which take microseconds.
     fn run<T: Scalar>(
         &mut self,
-        depth: &[T],
-        alpha: &[T],
+        frame: DepthPlanes<T>,
         samples: &[DepthSample],
         kind: DepthKind,
         weight: f64,
-        v_depth: &mut [T],
-        v_alpha: &mut [T],
+        gradient: &mut DepthGradient<T>,
     ) -> DepthValues {
-        for length in [alpha.len(), v_depth.len(), v_alpha.len()] {
-            assert_eq!(length, depth.len(), "depth, alpha and their gradients are [H, W]");
-        }
-        self.collect(depth, alpha, samples);
+        frame.assert_lengths(gradient, frame.depth.len());
+        self.collect(frame, samples);
         let (fit, norm) = match kind {
             DepthKind::Metric => (Fit::NONE, self.sum(|s| s.weight * s.given)),
-            DepthKind::Relative => (Fit::of(&self.counted), self.sum(|s| s.weight * s.rendered)),
+            DepthKind::Relative => (Fit::least_squares(&self.counted), self.sum(|s| s.weight * s.rendered)),
         };
         // Also false for NaN; without samples the loss stays 0. Depths that rise where the render falls show something else: a fit of scale
         // 0 would pull the whole view to one depth.
@@ -135,8 +129,8 @@ impl DepthLoss {
                 v_rendered += s.weight / fit.weight * through_fit - s.weight * loss;
             }
             let v_rendered = weight * v_rendered / norm;
-            let opacity = alpha[s.pixel].to_f64();
-            let (v_d, v_a) = (&mut v_depth[s.pixel], &mut v_alpha[s.pixel]);
+            let opacity = frame.alpha[s.pixel].to_f64();
+            let (v_d, v_a) = (&mut gradient.depth[s.pixel], &mut gradient.alpha[s.pixel]);
             *v_d = *v_d + T::from_f64(v_rendered / opacity);
             *v_a = *v_a + T::from_f64(-v_rendered * s.rendered / opacity);
         }
@@ -148,15 +142,15 @@ impl DepthLoss {
         }
     }
 
-    fn collect<T: Scalar>(&mut self, depth: &[T], alpha: &[T], samples: &[DepthSample]) {
+    fn collect<T: Scalar>(&mut self, frame: DepthPlanes<T>, samples: &[DepthSample]) {
         self.counted.clear();
         let good = |value: f32| value > 0.0 && value.is_finite();
         for sample in samples.iter().filter(|s| good(s.depth) && good(s.weight)) {
             let pixel = sample.pixel as usize;
-            let Some(opacity) = alpha.get(pixel).map(|a| a.to_f64()) else {
+            let Some(opacity) = frame.alpha.get(pixel).map(|a| a.to_f64()) else {
                 continue;
             };
-            let rendered = depth[pixel].to_f64() / opacity;
+            let rendered = frame.depth[pixel].to_f64() / opacity;
             if opacity > 0.0 && opacity >= f64::from(self.min_alpha) && rendered.is_finite() {
                 self.counted.push(Counted {
                     pixel,
@@ -197,8 +191,8 @@ impl Fit {
         weight: 1.0,
     };
 
-    /// Weighted least squares.
-    fn of(samples: &[Counted]) -> Self {
+    /// By weighted least squares.
+    fn least_squares(samples: &[Counted]) -> Self {
         let sum = |of: &dyn Fn(&Counted) -> f64| samples.iter().map(|s| s.weight * of(s)).sum::<f64>();
         let weight = sum(&|_| 1.0);
         let (mean_given, mean_rendered) = (sum(&|s| s.given) / weight, sum(&|s| s.rendered) / weight);
@@ -254,7 +248,12 @@ mod tests {
     fn value(depth: &[f64], alpha: &[f64], samples: &[DepthSample], kind: DepthKind) -> (DepthValues, [Vec<f64>; 2]) {
         let mut v = [vec![0.0; depth.len()], vec![0.0; depth.len()]];
         let [v_depth, v_alpha] = &mut v;
-        let values = DepthLoss::default().run(depth, alpha, samples, kind, 1.0, v_depth, v_alpha);
+        let mut gradient = DepthGradient {
+            depth: v_depth,
+            alpha: v_alpha,
+        };
+        let frame = DepthPlanes { depth, alpha };
+        let values = DepthLoss::default().run(frame, samples, kind, 1.0, &mut gradient);
         (values, v)
     }
 
@@ -359,15 +358,15 @@ mod tests {
         let (want, [v_want, _]) = value(&depth, &alpha, &samples, DepthKind::Relative);
         let single = |v: &[f64]| v.iter().map(|v| *v as f32).collect::<Vec<f32>>();
         let (mut v_depth, mut v_alpha) = (vec![1.0; PIXELS], vec![0.0; PIXELS]);
-        let got = DepthLoss::default().evaluate(
-            &single(&depth),
-            &single(&alpha),
-            &samples,
-            DepthKind::Relative,
-            2.0,
-            &mut v_depth,
-            &mut v_alpha,
-        );
+        let frame = DepthPlanes {
+            depth: &single(&depth),
+            alpha: &single(&alpha),
+        };
+        let mut gradient = DepthGradient {
+            depth: &mut v_depth,
+            alpha: &mut v_alpha,
+        };
+        let got = DepthLoss::default().evaluate(frame, &samples, DepthKind::Relative, 2.0, &mut gradient);
         assert!((got.loss - want.loss).abs() < 1e-6);
         for (got, want) in v_depth.iter().zip(&v_want) {
             assert!((f64::from(*got) - 1.0 - 2.0 * want).abs() < 1e-5, "{got} {want}");

@@ -81,6 +81,37 @@ pub struct Target<'a, T = f32> {
     pub mask: Option<&'a [u8]>,
 }
 
+/// The depth of a frame, as blending accumulates it.
+#[derive(Clone, Copy, Debug)]
+pub struct DepthPlanes<'a, T = f32> {
+    /// Accumulated depth, `[H * W]`: the expected depth times the opacity.
+    pub depth: &'a [T],
+    /// Opacity, `[H * W]`.
+    pub alpha: &'a [T],
+}
+
+/// The gradient of [`DepthPlanes`], to which losses add theirs.
+#[derive(Debug)]
+pub struct DepthGradient<'a, T = f32> {
+    /// Of the accumulated depth, `[H * W]`.
+    pub depth: &'a mut [T],
+    /// Of the opacity, `[H * W]`.
+    pub alpha: &'a mut [T],
+}
+
+impl<T> DepthPlanes<'_, T> {
+    fn assert_lengths(&self, gradient: &DepthGradient<T>, pixels: usize) {
+        for length in [
+            self.depth.len(),
+            self.alpha.len(),
+            gradient.depth.len(),
+            gradient.alpha.len(),
+        ] {
+            assert_eq!(length, pixels, "depth, alpha and their gradients are [H, W]");
+        }
+    }
+}
+
 /// Computes the loss and its gradient; reuses its working memory, so that only the first call allocates.
 ///
 /// `T` is `f32`; tests run the same code in double precision.

@@ -10,6 +10,7 @@
 //!
 //! The loss constrains neither scale nor absolute depth. Samples at depth edges do not count.
 
+use super::{DepthGradient, DepthPlanes};
 use glam::{DVec3, Vec2};
 use irradia_compute::simd::Scalar;
 use irradia_scene::Intrinsics;
@@ -40,60 +41,45 @@ impl Default for NormalLoss {
 }
 
 impl NormalLoss {
-    /// The loss of the accumulated `depth [H * W]` and `alpha [H * W]` of a frame of `camera`; `weight` times the gradients is added to
-    /// `v_depth` and `v_alpha`, of the same shape. The four depths of a sample are `reach` pixels from it; samples whose pixels are not all
-    /// in the image do not count.
+    /// The loss of `frame`, which `camera` sees; `weight` times its gradient is added to `gradient`. The four depths of a sample are `reach`
+    /// pixels from it; samples whose pixels are not all in the image do not count.
     ///
     /// # Panics
     /// When the lengths differ: a bug in the caller.
     pub fn evaluate(
         &self,
-        depth: &[f32],
-        alpha: &[f32],
+        frame: DepthPlanes,
         camera: &Intrinsics,
         samples: &[NormalSample],
         reach: u32,
         weight: f32,
-        v_depth: &mut [f32],
-        v_alpha: &mut [f32],
+        gradient: &mut DepthGradient,
     ) -> f64 {
-        self.run(
-            depth,
-            alpha,
-            camera,
-            samples,
-            reach,
-            f64::from(weight),
-            v_depth,
-            v_alpha,
-        )
+        self.run(frame, camera, samples, reach, f64::from(weight), gradient)
     }
 
     // Single-threaded: a view has a few thousand samples, which take less than a millisecond.
     fn run<T: Scalar>(
         &self,
-        depth: &[T],
-        alpha: &[T],
+        frame: DepthPlanes<T>,
         camera: &Intrinsics,
         samples: &[NormalSample],
         reach: u32,
         weight: f64,
-        v_depth: &mut [T],
-        v_alpha: &mut [T],
+        gradient: &mut DepthGradient<T>,
     ) -> f64 {
-        for length in [alpha.len(), v_depth.len(), v_alpha.len()] {
-            assert_eq!(length, depth.len(), "depth, alpha and their gradients are [H, W]");
-        }
-        let stencil = |sample: &NormalSample| self.stencil(depth, alpha, camera, sample, reach);
+        frame.assert_lengths(gradient, frame.depth.len());
+        let stencil = |sample: &NormalSample| self.stencil(frame, camera, sample, reach);
         let counted: Vec<Stencil> = samples.iter().filter_map(stencil).collect();
         let mut sum = 0.0;
         for at in &counted {
             sum += 1.0 - at.normal().0.dot(at.given);
             let v = at.vjp(weight / counted.len() as f64);
             for ((pixel, rendered), v) in at.pixels.iter().zip(at.depths).zip(v) {
-                let opacity = alpha[*pixel].to_f64();
-                v_depth[*pixel] = v_depth[*pixel] + T::from_f64(v / opacity);
-                v_alpha[*pixel] = v_alpha[*pixel] + T::from_f64(-v * rendered / opacity);
+                let opacity = frame.alpha[*pixel].to_f64();
+                let (v_d, v_a) = (&mut gradient.depth[*pixel], &mut gradient.alpha[*pixel]);
+                *v_d = *v_d + T::from_f64(v / opacity);
+                *v_a = *v_a + T::from_f64(-v * rendered / opacity);
             }
         }
         sum / counted.len().max(1) as f64
@@ -101,8 +87,7 @@ impl NormalLoss {
 
     fn stencil<T: Scalar>(
         &self,
-        depth: &[T],
-        alpha: &[T],
+        frame: DepthPlanes<T>,
         camera: &Intrinsics,
         sample: &NormalSample,
         reach: u32,
@@ -117,8 +102,8 @@ impl NormalLoss {
         let pixels = places.map(|[x, y]| y as usize * camera.width as usize + x as usize);
         let mut depths = [0.0; 4];
         for (depth_at, pixel) in depths.iter_mut().zip(pixels) {
-            let opacity = alpha.get(pixel)?.to_f64();
-            *depth_at = depth[pixel].to_f64() / opacity;
+            let opacity = frame.alpha.get(pixel)?.to_f64();
+            *depth_at = frame.depth[pixel].to_f64() / opacity;
             let usable = opacity >= f64::from(self.min_alpha) && *depth_at > 0.0 && depth_at.is_finite();
             if !usable {
                 return None;
@@ -212,7 +197,12 @@ mod tests {
     fn value(depth: &[f64], alpha: &[f64], samples: &[NormalSample]) -> (f64, [Vec<f64>; 2]) {
         let mut v = [vec![0.0; depth.len()], vec![0.0; depth.len()]];
         let [v_depth, v_alpha] = &mut v;
-        let loss = NormalLoss::default().run(depth, alpha, &camera(), samples, 2, 1.0, v_depth, v_alpha);
+        let mut gradient = DepthGradient {
+            depth: v_depth,
+            alpha: v_alpha,
+        };
+        let frame = DepthPlanes { depth, alpha };
+        let loss = NormalLoss::default().run(frame, &camera(), samples, 2, 1.0, &mut gradient);
         (loss, v)
     }
 

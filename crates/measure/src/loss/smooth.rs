@@ -11,7 +11,7 @@
 //! otherwise a scene could become smooth by moving away. The gradient includes the mean. k = 0 is total variation. Pixels that
 //! are masked or nearly transparent are excluded.
 
-use super::{Target, Truth};
+use super::{DepthGradient, DepthPlanes, Target, Truth};
 use crate::real::{Real, sum_over};
 use rayon::prelude::*;
 
@@ -42,34 +42,32 @@ impl Default for SmoothLoss {
 }
 
 impl SmoothLoss {
-    /// The loss of the accumulated `depth [H * W]` and `alpha [H * W]`, guided by the photograph `target` (with colours in
-    /// \[0, 1\], so that with k = 10 an edge of 0.1 has a weight of 1 / e); `weight` times the gradients is added to `v_depth`
-    /// and `v_alpha`, of the same shape.
+    /// The loss of `frame`, guided by the photograph `target` (with colours in \[0, 1\], so that with k = 10 an edge of 0.1 has a
+    /// weight of 1 / e); `weight` times its gradient is added to `gradient`.
     ///
     /// # Panics
     /// When a length does not match the target's size: a bug in the caller.
     pub fn evaluate(
         &mut self,
-        depth: &[f32],
-        alpha: &[f32],
+        frame: DepthPlanes,
         target: &Target,
         of: Smoothed,
         k: f32,
         weight: f32,
-        v_depth: &mut [f32],
-        v_alpha: &mut [f32],
+        gradient: &mut DepthGradient,
     ) -> f64 {
-        let knobs = Knobs {
+        let settings = SmoothSettings {
             of,
             k: f64::from(k),
             min_alpha: self.min_alpha,
             weight: f64::from(weight),
         };
-        self.memory.evaluate(depth, alpha, target, &knobs, v_depth, v_alpha)
+        self.memory.evaluate(frame, target, &settings, gradient)
     }
 }
 
-struct Knobs {
+/// How a frame is smoothed; the arguments and fields of [`SmoothLoss`].
+struct SmoothSettings {
     of: Smoothed,
     k: f64,
     min_alpha: f32,
@@ -94,23 +92,20 @@ const MAX_DIFFERENCE: usize = 3 * 255;
 impl<T: Real> Memory<T> {
     fn evaluate(
         &mut self,
-        depth: &[T],
-        alpha: &[T],
+        frame: DepthPlanes<T>,
         target: &Target<T>,
-        knobs: &Knobs,
-        v_depth: &mut [T],
-        v_alpha: &mut [T],
+        settings: &SmoothSettings,
+        gradient: &mut DepthGradient<T>,
     ) -> f64 {
         let (width, height) = (target.width, target.height);
-        for length in [depth.len(), alpha.len(), v_depth.len(), v_alpha.len()] {
-            assert_eq!(length, width * height, "depth, alpha and their gradients are [H, W]");
-        }
+        frame.assert_lengths(gradient, width * height);
         target.assert_truth();
+        let DepthPlanes { depth, alpha } = frame;
         self.q.resize(width * height, T::zero());
         self.slopes.resize(2 * width * height, T::zero());
         self.sums.resize(height, 0.0);
         self.edges.clear();
-        let weight = |i| T::from_f64((-knobs.k * f64::from(i) / MAX_DIFFERENCE as f64).exp());
+        let weight = |i| T::from_f64((-settings.k * f64::from(i) / MAX_DIFFERENCE as f64).exp());
         self.edges.extend((0..=MAX_DIFFERENCE as u16).map(weight));
         if width * height == 0 {
             return 0.0;
@@ -120,7 +115,7 @@ impl<T: Real> Memory<T> {
         rows.for_each(|(y, (q, sum))| {
             let row = y * width..(y + 1) * width;
             let mask = target.mask.map(|mask| &mask[row.clone()]);
-            *sum = quantities(&depth[row.clone()], &alpha[row], mask, knobs, q);
+            *sum = quantities(&depth[row.clone()], &alpha[row], mask, settings, q);
         });
         let total: f64 = self.sums.iter().sum();
         let sound = total > 0.0 && total.is_finite();
@@ -135,7 +130,7 @@ impl<T: Real> Memory<T> {
             let here = y * width;
             let row = &q[here..here + width];
             for x in 1..width {
-                right[x - 1] = edge(target, here + x - 1, here + x, edges, knobs.k);
+                right[x - 1] = edge(target, here + x - 1, here + x, edges, settings.k);
             }
             right[width - 1] = T::zero();
             *sum = slopes_between(&row[..width - 1], &row[1..], &mut right[..width - 1]);
@@ -144,19 +139,20 @@ impl<T: Real> Memory<T> {
                 return;
             }
             for x in 0..width {
-                down[x] = edge(target, here + x, here + width + x, edges, knobs.k);
+                down[x] = edge(target, here + x, here + width + x, edges, settings.k);
             }
             *sum += slopes_between(row, &q[here + width..here + 2 * width], down);
         });
         let loss = self.sums.iter().sum::<f64>() / total;
 
         let slopes = &self.slopes;
-        let gain = T::from_f64(knobs.weight / total);
+        let gain = T::from_f64(settings.weight / total);
         let by_mean = T::from_f64(loss);
-        let sign = match knobs.of {
+        let sign = match settings.of {
             Smoothed::Disparity => -T::one(),
             Smoothed::Depth => T::one(),
         };
+        let (v_depth, v_alpha) = (&mut *gradient.depth, &mut *gradient.alpha);
         let rows = v_depth.par_chunks_mut(width).zip(v_alpha.par_chunks_mut(width));
         rows.enumerate().for_each(|(y, (v_depth, v_alpha))| {
             let (right, down) = slopes[2 * y * width..2 * (y + 1) * width].split_at(width);
@@ -183,11 +179,11 @@ impl<T: Real> Memory<T> {
 }
 
 /// q of a row, and its sum.
-fn quantities<T: Real>(depth: &[T], alpha: &[T], mask: Option<&[u8]>, knobs: &Knobs, q: &mut [T]) -> f64 {
-    let min_alpha = T::from_f64(f64::from(knobs.min_alpha)).max(T::min_positive_value());
+fn quantities<T: Real>(depth: &[T], alpha: &[T], mask: Option<&[u8]>, settings: &SmoothSettings, q: &mut [T]) -> f64 {
+    let min_alpha = T::from_f64(f64::from(settings.min_alpha)).max(T::min_positive_value());
     let mut sum = 0.0;
     for x in 0..q.len() {
-        let quantity = match knobs.of {
+        let quantity = match settings.of {
             Smoothed::Disparity => alpha[x] / depth[x],
             Smoothed::Depth => depth[x] / alpha[x],
         };
@@ -233,8 +229,8 @@ mod tests {
     use irradia_scene::Rng;
     use irradia_testkit::finite_differences::{FiniteDifferences, sample_indices};
 
-    fn knobs(of: Smoothed, k: f64) -> Knobs {
-        Knobs {
+    fn settings(of: Smoothed, k: f64) -> SmoothSettings {
+        SmoothSettings {
             of,
             k,
             min_alpha: 0.5,
@@ -242,10 +238,15 @@ mod tests {
         }
     }
 
-    fn value(depth: &[f64], alpha: &[f64], target: &Target<f64>, knobs: &Knobs) -> (f64, [Vec<f64>; 2]) {
+    fn value(depth: &[f64], alpha: &[f64], target: &Target<f64>, settings: &SmoothSettings) -> (f64, [Vec<f64>; 2]) {
         let mut v = [vec![0.0; depth.len()], vec![0.0; depth.len()]];
         let [v_depth, v_alpha] = &mut v;
-        let loss = Memory::default().evaluate(depth, alpha, target, knobs, v_depth, v_alpha);
+        let mut gradient = DepthGradient {
+            depth: v_depth,
+            alpha: v_alpha,
+        };
+        let frame = DepthPlanes { depth, alpha };
+        let loss = Memory::default().evaluate(frame, target, settings, &mut gradient);
         (loss, v)
     }
 
@@ -264,13 +265,13 @@ mod tests {
                 for (k, masked) in [(10.0, false), (0.0, true), (3.0, true)] {
                     let picture = Picture::random(width, height, masked, seed as u64);
                     let (depth, alpha) = planes(width * height, seed as u64);
-                    let (target, knobs) = (picture.target(), knobs(of, k));
-                    let (_, [v_depth, v_alpha]) = value(&depth, &alpha, &target, &knobs);
+                    let (target, settings) = (picture.target(), settings(of, k));
+                    let (_, [v_depth, v_alpha]) = value(&depth, &alpha, &target, &settings);
                     // For these seeds no two neighbours are within a step of each other, and no alpha within a step of the threshold.
-                    let by_depth = |depth: &[f64]| value(depth, &alpha, &target, &knobs).0;
+                    let by_depth = |depth: &[f64]| value(depth, &alpha, &target, &settings).0;
                     let differences = FiniteDifferences::relative_to_max(1e-7, 1e-6);
                     differences.check("depth", &depth, &v_depth, sample_indices(depth.len()), by_depth);
-                    let by_alpha = |alpha: &[f64]| value(&depth, alpha, &target, &knobs).0;
+                    let by_alpha = |alpha: &[f64]| value(&depth, alpha, &target, &settings).0;
                     differences.check("alpha", &alpha, &v_alpha, sample_indices(alpha.len()), by_alpha);
                 }
             }
@@ -290,7 +291,7 @@ mod tests {
             mask: None,
         };
         for k in [0.0, 10.0] {
-            let (loss, _) = value(&depth, &alpha, &plain, &knobs(Smoothed::Depth, k));
+            let (loss, _) = value(&depth, &alpha, &plain, &settings(Smoothed::Depth, k));
             assert!((loss - 0.25).abs() < 1e-12, "{loss}");
         }
         // A change of 0.1 in every channel where the depth changes.
@@ -299,12 +300,12 @@ mod tests {
             truth: Truth::Planar(&edge[..]),
             ..plain
         };
-        let (loss, _) = value(&depth, &alpha, &excused, &knobs(Smoothed::Depth, 10.0));
+        let (loss, _) = value(&depth, &alpha, &excused, &settings(Smoothed::Depth, 10.0));
         assert!((loss - 0.25 * (-1.0f64).exp()).abs() < 1e-12, "{loss}");
         // Disparities 1 and 1/3: two pairs of 2/3 over 16/3.
-        let (loss, _) = value(&depth, &alpha, &plain, &knobs(Smoothed::Disparity, 0.0));
+        let (loss, _) = value(&depth, &alpha, &plain, &settings(Smoothed::Disparity, 0.0));
         assert!((loss - 0.25).abs() < 1e-12, "{loss}");
-        let (flat, v) = value(&[2.0; 8], &alpha, &plain, &knobs(Smoothed::Disparity, 1.0));
+        let (flat, v) = value(&[2.0; 8], &alpha, &plain, &settings(Smoothed::Disparity, 1.0));
         assert!(flat == 0.0 && v.iter().flatten().all(|v| *v == 0.0));
     }
 
@@ -312,19 +313,19 @@ mod tests {
     fn the_loss_is_scale_invariant_and_excludes_empty_pixels() {
         let picture = Picture::random(12, 9, false, 4);
         let (mut depth, mut alpha) = planes(108, 4);
-        let (target, knobs) = (picture.target(), knobs(Smoothed::Disparity, 5.0));
-        let (first, _) = value(&depth, &alpha, &target, &knobs);
+        let (target, settings) = (picture.target(), settings(Smoothed::Disparity, 5.0));
+        let (first, _) = value(&depth, &alpha, &target, &settings);
         let larger: Vec<f64> = depth.iter().map(|d| 1000.0 * d).collect();
-        assert!((value(&larger, &alpha, &target, &knobs).0 - first).abs() < 1e-12);
+        assert!((value(&larger, &alpha, &target, &settings).0 - first).abs() < 1e-12);
 
         for (i, poison) in [f64::NAN, f64::INFINITY, -1.0, 0.0].into_iter().enumerate() {
             (depth[20 * i], alpha[20 * i]) = (poison, 1.0);
             (depth[20 * i + 1], alpha[20 * i + 1]) = (1e9, 0.1);
         }
-        let (loss, [v_depth, v_alpha]) = value(&depth, &alpha, &target, &knobs);
+        let (loss, [v_depth, v_alpha]) = value(&depth, &alpha, &target, &settings);
         assert!(loss.is_finite() && v_depth.iter().chain(&v_alpha).all(|v| v.is_finite()));
         assert!((0..4).all(|i| v_depth[20 * i] == 0.0 && v_alpha[20 * i + 1] == 0.0));
-        let (nothing, v) = value(&depth, &[0.0; 108], &target, &knobs);
+        let (nothing, v) = value(&depth, &[0.0; 108], &target, &settings);
         assert!(nothing == 0.0 && v.iter().flatten().all(|v| *v == 0.0));
     }
 
@@ -346,19 +347,17 @@ mod tests {
                 mask: picture.mask.as_deref(),
             };
             let (mut v_depth, mut v_alpha) = (vec![first; 682], vec![first; 682]);
+            let frame = DepthPlanes {
+                depth: &depth,
+                alpha: &alpha,
+            };
+            let mut gradient = DepthGradient {
+                depth: &mut v_depth,
+                alpha: &mut v_alpha,
+            };
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             let loss = pool.install(|| {
-                let mut loss = SmoothLoss::default();
-                loss.evaluate(
-                    &depth,
-                    &alpha,
-                    &target,
-                    Smoothed::Disparity,
-                    8.0,
-                    3.0,
-                    &mut v_depth,
-                    &mut v_alpha,
-                )
+                SmoothLoss::default().evaluate(frame, &target, Smoothed::Disparity, 8.0, 3.0, &mut gradient)
             });
             (loss, v_depth, v_alpha)
         };

@@ -23,8 +23,8 @@ use irradia_compute::simd::{Lanes, Scalar, Simd};
 /// Rows per step.
 const ROWS_PER_STEP: usize = 4;
 /// Rows covered by the windows of a step's rows.
-const WINDOW_ROWS: usize = ROWS_PER_STEP + 2 * RADIUS;
-/// Rows in a ring, a power of two not below `WINDOW_ROWS`.
+const STEP_WINDOW_ROWS: usize = ROWS_PER_STEP + 2 * RADIUS;
+/// Rows in a ring, a power of two not below `STEP_WINDOW_ROWS`.
 const RING_ROWS: usize = 16;
 /// Rows of a ring of moments per image row: x, y, m, s, p.
 const MOMENTS: usize = 5;
@@ -163,12 +163,17 @@ fn blur_moments<S: Simd>(simd: S, scratch: &mut Scratch<ScalarOf<S>>, window: &W
     }
 }
 
-/// The rows `first..first + WINDOW_ROWS` of part `part` of a ring of `parts`, all of one length.
+/// The rows `first..first + STEP_WINDOW_ROWS` of part `part` of a ring of `parts`, all of one length.
 #[inline(always)]
-fn window_rows<T: Scalar>(ring: &Rows<T>, first: usize, parts: usize, part: usize) -> [&[[T; BLOCK]]; WINDOW_ROWS] {
+fn window_rows<T: Scalar>(
+    ring: &Rows<T>,
+    first: usize,
+    parts: usize,
+    part: usize,
+) -> [&[[T; BLOCK]]; STEP_WINDOW_ROWS] {
     let row = |k: usize| ring.blocks((first + k) % RING_ROWS * parts + part);
     let blocks = row(0).len();
-    let mut rows: [&[[T; BLOCK]]; WINDOW_ROWS] = [&[]; WINDOW_ROWS];
+    let mut rows: [&[[T; BLOCK]]; STEP_WINDOW_ROWS] = [&[]; STEP_WINDOW_ROWS];
     for (k, slot) in rows.iter_mut().enumerate() {
         // The compiler must see that the lengths are equal, or it checks every load.
         *slot = &row(k)[..blocks];
@@ -180,13 +185,13 @@ fn window_rows<T: Scalar>(ring: &Rows<T>, first: usize, parts: usize, part: usiz
 #[inline(always)]
 fn along_y<S: Simd>(
     simd: S,
-    rows: &[&[[ScalarOf<S>; BLOCK]]; WINDOW_ROWS],
+    rows: &[&[[ScalarOf<S>; BLOCK]]; STEP_WINDOW_ROWS],
     block: usize,
     at: usize,
     window: &Window<S::F>,
 ) -> [S::F; ROWS_PER_STEP] {
-    let mut values = [simd.splat(0.0); WINDOW_ROWS];
-    for k in 0..WINDOW_ROWS {
+    let mut values = [simd.splat(0.0); STEP_WINDOW_ROWS];
+    for k in 0..STEP_WINDOW_ROWS {
         values[k] = simd.load(&rows[k][block][at..]);
     }
     let mut out = [simd.splat(0.0); ROWS_PER_STEP];

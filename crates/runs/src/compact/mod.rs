@@ -185,14 +185,13 @@ pub fn compact(input: &CompactInput, on_event: &mut dyn FnMut(CompactEvent)) -> 
     if let Some(loss) = input.keep_psnr.filter(|loss| found.psnr < before - loss) {
         notes.push(format!("every try lost more than {loss} dB: all splats are kept"));
     }
-    let model = tries.model(&found.splats);
-    let held_out_after = measure.held_out_psnr(&model)?;
+    let held_out_after = measure.held_out_psnr(&Model::of_splats(&found.splats))?;
     notes.extend(write_scene(&input.out, &tries.cloud(&found.splats), &found.write)?);
     Ok(Compacted {
         formats: [SplatFormat::of(&file)?, format],
         bytes: [splat_file_size(&file)?, splat_file_size(&input.out)?],
         splats: [count, found.splats.len()],
-        with_harmonics: found.with_harmonics(),
+        with_harmonics: found.count_with_harmonics(),
         psnr: [before, found.psnr],
         held_out_psnr: held_out_before.zip(held_out_after).map(Into::into),
         notes,

@@ -25,6 +25,7 @@ const REMOVAL_ROUNDS: u32 = 6;
 const MAX_MEASURED_VIEWS: usize = 32;
 /// Maximum number of views from which contributions are computed.
 const MAX_CONTRIBUTION_VIEWS: usize = 160;
+
 /// How finely the file represents a scene.
 #[derive(Clone, Copy)]
 struct Quality {
@@ -136,7 +137,7 @@ pub(super) struct DecodedScene {
 
 impl DecodedScene {
     /// Number of splats with harmonics above degree 0.
-    pub fn with_harmonics(&self) -> usize {
+    pub fn count_with_harmonics(&self) -> usize {
         let sh = &self.splats.sh;
         let shows = |i: &usize| (3..sh.count()).any(|c| sh.get(c, *i) != 0.0);
         (0..self.splats.len()).filter(shows).count()
@@ -194,11 +195,6 @@ impl<'a> Tries<'a> {
         self.quality = COARSE_QUALITY;
     }
 
-    /// `splats` for rendering.
-    pub fn model<'s>(&self, splats: &'s Splats) -> Model<'s> {
-        Model::of_splats(splats)
-    }
-
     /// `splats` for writing.
     pub fn cloud(&self, splats: &Splats) -> GaussianCloud {
         GaussianCloud {
@@ -250,8 +246,11 @@ impl<'a> Tries<'a> {
         trainer.sockets.vignette.clone_from(&self.measure.vignette);
         let (mut rounds, mut stage, mut events) = (0, 0, Vec::new());
         while !trainer.finished() {
-            let removed = trainer.clock.time / self.recipe.stage[0].steps as f64;
-            if rounds < REMOVAL_ROUNDS && removed >= f64::from(rounds) / f64::from(REMOVAL_ROUNDS) && count < first {
+            let elapsed_share = trainer.clock.time / self.recipe.stage[0].steps as f64;
+            if rounds < REMOVAL_ROUNDS
+                && elapsed_share >= f64::from(rounds) / f64::from(REMOVAL_ROUNDS)
+                && count < first
+            {
                 rounds += 1;
                 // The number decreases by the same factor in each round.
                 let share = (count as f64 / first as f64).powf(f64::from(rounds) / f64::from(REMOVAL_ROUNDS));
@@ -286,7 +285,7 @@ impl<'a> Tries<'a> {
         let (splats, bytes) = self.round_trip(&trainer.engine.state().splats)?;
         let found = DecodedScene {
             bytes,
-            psnr: self.measure.train_psnr(&self.model(&splats))?,
+            psnr: self.measure.train_psnr(&Model::of_splats(&splats))?,
             write: self.write_options(splats.len()),
             splats,
         };

@@ -194,9 +194,10 @@ fn models(
     };
     let is_mostly_mapped =
         infos.len() > FEW_PHOTOS && 2 * found.registered() >= infos.len() && found.split_models.is_none();
-    let again = match is_mostly_mapped {
-        true => complete(infos, work.features(), pairs, &found, &guided, on_progress),
-        false => reconstruct(infos, work.features(), pairs, &guided, on_progress),
+    let again = if is_mostly_mapped {
+        complete(infos, work.features(), pairs, &found, &guided, on_progress)
+    } else {
+        reconstruct(infos, work.features(), pairs, &guided, on_progress)
     };
     if again.registered() > found.registered() {
         again

@@ -157,12 +157,13 @@ impl Capture {
         );
         unused(sources.live, "a film taken with the photograph of the same name");
         let named = sources.films.len();
-        match sources.found_films.is_empty() || sources.folders.is_empty() || film::is_ffmpeg_installed() {
-            true => sources.films.append(&mut sources.found_films),
-            false => unused(
+        if sources.found_films.is_empty() || sources.folders.is_empty() || film::is_ffmpeg_installed() {
+            sources.films.append(&mut sources.found_films);
+        } else {
+            unused(
                 sources.found_films,
                 "a film, which cannot be read without ffmpeg: install ffmpeg to use its frames",
-            ),
+            );
         }
         let needs_out = |what: &str| {
             let path = paths.first().map(|path| path.display().to_string()).unwrap_or_default();
@@ -207,9 +208,10 @@ impl Capture {
         let is_panorama = find_panoramas(&photos);
         let mut panoramas = Vec::new();
         for (photo, is) in photos.into_iter().zip(is_panorama) {
-            match is {
-                true => panoramas.push(photo),
-                false => self.folder.photos.push(photo),
+            if is {
+                panoramas.push(photo);
+            } else {
+                self.folder.photos.push(photo);
             }
         }
         panoramas

@@ -98,9 +98,10 @@ pub fn check_poses(dataset: &Dataset) -> PoseCheck {
         pairs: evidence_pairs(&pairs, &strengths).count(),
         jumps: contradicting.iter().filter(jump).copied().map(names).collect(),
         contradicting: contradicting.into_iter().map(names).collect(),
-        absent: match absent.len() >= MIN_MISSING_PAIRS {
-            true => absent.into_iter().map(names).collect(),
-            false => Vec::new(),
+        absent: if absent.len() >= MIN_MISSING_PAIRS {
+            absent.into_iter().map(names).collect()
+        } else {
+            Vec::new()
         },
     }
 }

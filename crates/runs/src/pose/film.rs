@@ -188,10 +188,13 @@ fn frame_counts(films: &[Vec<Frame>]) -> Vec<usize> {
     let motion = |frames: &Vec<Frame>| frames.iter().map(|frame| frame.motion).sum::<f64>();
     let total: f64 = films.iter().map(motion).sum();
     let wanted = ((total / FRAME_SPACING) as usize).clamp(FRAME_COUNT_RANGE[0], FRAME_COUNT_RANGE[1]);
-    let share = |frames: &Vec<Frame>| match total > 0.0 {
-        true => motion(frames) / total,
-        // Cameras that stand still.
-        false => 1.0 / films.len() as f64,
+    let share = |frames: &Vec<Frame>| {
+        if total > 0.0 {
+            motion(frames) / total
+        } else {
+            // Cameras that stand still.
+            1.0 / films.len() as f64
+        }
     };
     let count = |frames| ((share(frames) * wanted as f64).round() as usize).max(MIN_FRAMES_PER_FILM);
     films.iter().map(count).collect()

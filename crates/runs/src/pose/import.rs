@@ -127,9 +127,10 @@ pub(super) fn record(out: &Path, posed: &[&PhotoEntry], added: bool) -> Result<(
     };
     let files = posed.iter().flat_map(|photo| associated_files(photo));
     let mut now: Files = files.filter(is_imported).map(|file| file.relative_path()).collect();
-    match added {
-        true => now.extend(before),
-        false => move_to_unused(out, before.difference(&now).cloned())?,
+    if added {
+        now.extend(before);
+    } else {
+        move_to_unused(out, before.difference(&now).cloned())?;
     }
     write_atomic(&out.join(RECORD_FILE), |file| file.write_all(&to_json(&now)))?;
     Ok(())

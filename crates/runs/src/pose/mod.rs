@@ -34,12 +34,14 @@ use capture::Capture;
 use irradia_formats::{PhotoEntry, PhotoFolder, write_atomic};
 use irradia_sfm::doctor::Kind;
 use irradia_sfm::map::{MapOptions, PhotoInfo, Reconstruction};
+use known::KnownPoses;
 use serde::{Deserialize, Serialize};
 use stages::Work;
 use std::collections::HashSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
+use still::Masked;
 
 pub use capture::is_capture;
 pub use check::{PoseCheck, check_poses};
@@ -275,11 +277,39 @@ pub struct StageReport {
 /// The result depends neither on the number of threads nor on the order of the files.
 ///
 /// # Errors
-/// When there are fewer than three photographs, a film cannot be read, no three photographs can be posed together, a distance is not
-/// between two posed photographs, `out` contains a dataset that was not written by this function, or no dataset to which photographs
-/// could be added, or a file cannot be written.
+/// When options exclude each other, there are fewer than three photographs, a film cannot be read, no three photographs can be posed
+/// together, a distance is not between two posed photographs, `out` contains a dataset that was not written by this function, or no dataset
+/// to which photographs could be added, or a file cannot be written.
 pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Result<PoseReport, RunError> {
     let started = Instant::now();
+    check_input(input)?;
+    let out = &input.out;
+    let known = if input.into {
+        Some(KnownPoses::read(out)?)
+    } else {
+        check_free(out)?;
+        None
+    };
+    fs::create_dir_all(out).map_err(RunError::io("create", out))?;
+    let mut clock = StageTimer::new();
+    let capture = read_capture(input, known.as_ref(), progress)?;
+    import::clear_stale(out, &capture.folder.photos)?;
+    clock.end("photographs");
+    let mut posing = Posing {
+        input,
+        capture: &capture,
+        progress,
+        clock,
+    };
+    let report = match input.mapper {
+        Mapper::Irradia => posing.pose_with_irradia(known)?,
+        Mapper::Colmap => posing.pose_with_colmap()?,
+    };
+    posing.finish_report(report, started)
+}
+
+/// Rejects options that are out of range or exclude each other, before anything is read or written.
+fn check_input(input: &PoseInput) -> Result<(), RunError> {
     if input.max_features == Some(0) {
         return Err(RunError::setting("max_features", 0, "must be 1 or more"));
     }
@@ -290,18 +320,31 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
             "adding photographs does not change the unit: leave out --distance",
         ));
     }
-    let out = &input.out;
-    let known = match input.into {
-        true => Some(known::KnownPoses::read(out)?),
-        false => {
-            check_free(out)?;
-            None
-        }
-    };
-    fs::create_dir_all(out).map_err(RunError::io("create", out))?;
-    let mut clock = StageTimer::new();
-    let mut capture = Capture::read(&input.photos, Some(out), input.into, progress)?;
-    still::ignore_own_masks(&mut capture.folder.photos, out)?;
+    if input.mapper == Mapper::Colmap && !input.distances.is_empty() {
+        return Err(RunError::setting(
+            "mapper",
+            "colmap",
+            "COLMAP's poses are not scaled: leave out --distance or --poses colmap",
+        ));
+    }
+    if input.mapper == Mapper::Colmap && input.into {
+        return Err(RunError::setting(
+            "mapper",
+            "colmap",
+            "COLMAP cannot add photographs to a dataset: leave out --into or --poses colmap",
+        ));
+    }
+    Ok(())
+}
+
+/// Reads the photographs to pose, and those of the dataset to which they are added, whose poses are `known`.
+fn read_capture(
+    input: &PoseInput,
+    known: Option<&KnownPoses>,
+    progress: &(dyn Fn(PoseProgress) + Sync),
+) -> Result<Capture, RunError> {
+    let mut capture = Capture::read(&input.photos, Some(&input.out), input.into, progress)?;
+    still::ignore_own_masks(&mut capture.folder.photos, &input.out)?;
     if let Some(only) = &input.only {
         let bare = |name: &str| name.rsplit_once('.').map_or(name, |(bare, _)| bare).to_owned();
         let is_one = |photo: &PhotoEntry| only.contains(&photo.name) || only.contains(&bare(&photo.name));
@@ -309,131 +352,170 @@ pub fn pose(input: &PoseInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> Resu
             capture.folder.photos.retain(is_one);
         }
     }
-    if let Some(known) = &known {
+    if let Some(known) = known {
         capture.folder = known.combined_with(capture.folder)?;
     }
-    let mut folder = &capture.folder;
-    check_photo_count(&input.photos, folder)?;
-    metric_scale::check_distances(&input.distances, folder)?;
-    import::clear_stale(out, &folder.photos)?;
-    clock.end("photographs");
-    if input.mapper == Mapper::Colmap {
-        if !input.distances.is_empty() {
-            return Err(RunError::setting(
-                "mapper",
-                "colmap",
-                "COLMAP's poses are not scaled: leave out --distance or --poses colmap",
-            ));
-        }
-        if input.into {
-            return Err(RunError::setting(
-                "mapper",
-                "colmap",
-                "COLMAP cannot add photographs to a dataset: leave out --into or --poses colmap",
-            ));
-        }
-        let mut report = colmap::run(input, &capture, progress)?;
-        report.poses_by = PoseSource::Colmap;
-        clock.end("colmap");
-        report.stages = clock.stages;
-        report.seconds = started.elapsed().as_secs_f64();
-        write_atomic(&out.join(REPORT_FILE), |file| file.write_all(&to_json(&report)))?;
-        return Ok(report);
+    check_photo_count(&input.photos, &capture.folder)?;
+    metric_scale::check_distances(&input.distances, &capture.folder)?;
+    Ok(capture)
+}
+
+/// A call of [`pose`] whose photographs have been read.
+struct Posing<'a> {
+    input: &'a PoseInput,
+    capture: &'a Capture,
+    progress: &'a (dyn Fn(PoseProgress) + Sync),
+    clock: StageTimer,
+}
+
+impl Posing<'_> {
+    /// Has COLMAP find the poses and write them; returns the report without times.
+    fn pose_with_colmap(&mut self) -> Result<PoseReport, RunError> {
+        let report = colmap::run(self.input, self.capture, self.progress)?;
+        self.clock.end("colmap");
+        Ok(PoseReport {
+            poses_by: PoseSource::Colmap,
+            ..report
+        })
     }
 
-    let is_new = known.is_none();
-    let into = known.as_ref().map(|known| known.model.clone());
-    let by = match into {
-        Some(_) => pose_source(out).unwrap_or(PoseSource::Others),
-        None => PoseSource::Irradia,
-    };
-    let work = Work::new(input.max_features, Some(out), folder, progress);
-    let mut matched = Matched::find(work, &capture, false, &mut clock)?;
-    let masked = match is_new && !capture.has_panoramas() {
-        true => still::mask(&matched, folder, out, progress)?,
-        false => None,
-    };
-    if let Some(masked) = &masked {
-        clock.end("masks");
-        folder = &masked.folder;
-        matched = Matched::find(matched.work.masked(folder, out), &capture, true, &mut clock)?;
-    }
-    let mut attempt = matched.map(&input.mapping, known, &mut clock, progress)?;
-    let mut attempts = vec![attempt.report()];
-    if is_new && let Some(why) = attempt.retry_reason() {
-        let work = attempt.retry(input.max_features, out);
-        let most = work.sift().max_features;
-        let guided = match attempt::can_be_guided(folder.photos.len()) {
-            true => " and along epipolar lines",
-            false => "",
+    /// Finds the poses, or those of photographs that are not `known`, and writes them; returns the report without times.
+    fn pose_with_irradia(&mut self, known: Option<KnownPoses>) -> Result<PoseReport, RunError> {
+        let (input, capture, progress) = (self.input, self.capture, self.progress);
+        let out = &input.out;
+        let known_model = known.as_ref().map(|known| known.model.clone());
+        let poses_by = match known {
+            Some(_) => pose_source(out).unwrap_or(PoseSource::Others),
+            None => PoseSource::Irradia,
         };
-        progress(PoseProgress::Warned(format!(
-            "{why}: trying again with up to {most} features per photograph, matched by frontal descriptors{guided}",
-        )));
-        let again = Matched::find(work, &capture, masked.is_some(), &mut clock)?;
-        let again = again.map(&input.mapping, None, &mut clock, progress)?;
-        attempts.push(again.report());
-        if again.replaces(&attempt) {
-            attempt = again;
+        let is_new = known.is_none();
+        let may_mask = is_new && !capture.has_panoramas();
+        let work = Work::new(input.max_features, Some(out), &capture.folder, progress);
+        let mut matched = Matched::find(work, capture, false, &mut self.clock)?;
+        let masked = if may_mask {
+            still::mask(&matched, &capture.folder, out, progress)?
+        } else {
+            None
+        };
+        if let Some(masked) = &masked {
+            self.clock.end("masks");
+            let work = matched.work.masked(&masked.folder, out);
+            matched = Matched::find(work, capture, true, &mut self.clock)?;
         }
-    }
-    let mask_message = match &masked {
-        Some(masked) => Some(masked.message.clone()),
-        None if is_new && !capture.has_panoramas() => match still::mask_backdrop(&attempt, folder, out, progress)? {
-            None => still::mask_bars_and_text(&attempt, folder, out, progress)?,
-            mask_message => mask_message,
-        },
-        None => None,
-    };
-    if masked.is_none() && mask_message.is_some() {
-        clock.end("masks");
-    }
-    let Attempt {
-        matched: Matched {
-            mut work,
-            mut infos,
-            pairs,
-        },
-        mut reconstruction,
-    } = attempt;
-    reconstruction.regroup(&mut infos);
-    let scale = match reconstruction.models.first_mut() {
-        // Known poses keep their unit.
-        Some(model) if is_new => {
-            let gps_scale = metric_scale::scale_by_gps(folder, &mut work, model);
-            metric_scale::scale_by_distances(&input.distances, &infos, &mut work, model)?.or(gps_scale)
+        let mut attempt = matched.map(&input.mapping, known, &mut self.clock, progress)?;
+        let mut attempts = vec![attempt.report()];
+        if is_new && let Some(second) = self.second_attempt(&attempt, masked.is_some())? {
+            attempts.push(second.report());
+            if second.replaces(&attempt) {
+                attempt = second;
+            }
         }
-        _ => None,
-    };
-    clock.end("poses");
-    let still_region = masked.as_ref().map(|masked| &masked.still);
-    let mut examined = doctor::examine(&work, &infos, &pairs, &reconstruction, still_region);
-    doctor::add_unreadable(&mut examined, folder, &work);
-    doctor::write(out, folder, &work, &examined)?;
-    clock.end("doctor");
-    if reconstruction.models.is_empty() {
-        return Err(RunError::Refused(no_model_message(
-            &input.photos,
-            &infos,
-            &reconstruction,
-            &examined,
-        )));
+        let mask_message = match &masked {
+            Some(masked) => Some(masked.message.clone()),
+            None if may_mask => self.mask_after_posing(&attempt)?,
+            None => None,
+        };
+        let mut report = self.write(attempt, masked.as_ref(), known_model.as_deref())?;
+        report.poses_by = poses_by;
+        report.attempts = attempts;
+        report.warnings.extend(mask_message);
+        Ok(report)
     }
-    output::write(out, folder, &work, &infos, &reconstruction, into.as_deref())?;
-    clock.end("writing");
 
-    let mut report = output::report(folder, &work, &infos, &reconstruction);
-    report.findings = examined.findings;
-    report.poses_by = by;
-    report.scale = scale;
-    report.attempts = attempts;
-    report.pairs = pairs.len();
-    report.warnings = work.warnings().to_vec();
-    report.warnings.extend(mask_message);
-    report.stages = clock.stages;
-    report.seconds = started.elapsed().as_secs_f64();
-    write_atomic(&out.join(REPORT_FILE), |file| file.write_all(&to_json(&report)))?;
-    Ok(report)
+    /// The second attempt, if the `first` one gives a reason for it; `masked` as in [`Matched::find`].
+    fn second_attempt<'b>(&mut self, first: &Attempt<'b>, masked: bool) -> Result<Option<Attempt<'b>>, RunError> {
+        let Some(reason) = first.retry_reason() else {
+            return Ok(None);
+        };
+        let work = first.retry(self.input.max_features, &self.input.out);
+        let max_features = work.sift().max_features;
+        let guided = if attempt::can_be_guided(self.capture.folder.photos.len()) {
+            " and along epipolar lines"
+        } else {
+            ""
+        };
+        (self.progress)(PoseProgress::Warned(format!(
+            "{reason}: trying again with up to {max_features} features per photograph, matched by frontal \
+             descriptors{guided}",
+        )));
+        let matched = Matched::find(work, self.capture, masked, &mut self.clock)?;
+        let second = matched.map(&self.input.mapping, None, &mut self.clock, self.progress)?;
+        Ok(Some(second))
+    }
+
+    /// Masks what the poses do not need masked: the backdrop of a turntable, otherwise bars and text. Returns the message for the user.
+    fn mask_after_posing(&mut self, attempt: &Attempt) -> Result<Option<String>, RunError> {
+        let (folder, out) = (&self.capture.folder, &self.input.out);
+        let mut message = still::mask_backdrop(attempt, folder, out, self.progress)?;
+        if message.is_none() {
+            message = still::mask_bars_and_text(attempt, folder, out, self.progress)?;
+        }
+        if message.is_some() {
+            self.clock.end("masks");
+        }
+        Ok(message)
+    }
+
+    /// Scales the model to metres, and writes it and what the doctor finds; `known_model` is the folder of the model to which photographs
+    /// were added. Returns the report without times, attempts and the program that found the poses.
+    fn write(
+        &mut self,
+        attempt: Attempt,
+        masked: Option<&Masked>,
+        known_model: Option<&Path>,
+    ) -> Result<PoseReport, RunError> {
+        let (input, out) = (self.input, &self.input.out);
+        let folder = masked.map_or(&self.capture.folder, |masked| &masked.folder);
+        let Attempt {
+            matched: Matched {
+                mut work,
+                mut infos,
+                pairs,
+            },
+            mut reconstruction,
+        } = attempt;
+        reconstruction.regroup(&mut infos);
+        let scale = match reconstruction.models.first_mut() {
+            // Known poses keep their unit.
+            Some(model) if known_model.is_none() => {
+                let gps_scale = metric_scale::scale_by_gps(folder, &mut work, model);
+                metric_scale::scale_by_distances(&input.distances, &infos, &mut work, model)?.or(gps_scale)
+            }
+            _ => None,
+        };
+        self.clock.end("poses");
+        let still_region = masked.map(|masked| &masked.still);
+        let mut examined = doctor::examine(&work, &infos, &pairs, &reconstruction, still_region);
+        doctor::add_unreadable(&mut examined, folder, &work);
+        doctor::write(out, folder, &work, &examined)?;
+        self.clock.end("doctor");
+        if reconstruction.models.is_empty() {
+            return Err(RunError::Refused(no_model_message(
+                &input.photos,
+                &infos,
+                &reconstruction,
+                &examined,
+            )));
+        }
+        output::write(out, folder, &work, &infos, &reconstruction, known_model)?;
+        self.clock.end("writing");
+        Ok(PoseReport {
+            findings: examined.findings,
+            scale,
+            pairs: pairs.len(),
+            warnings: work.warnings().to_vec(),
+            ..output::report(folder, &work, &infos, &reconstruction)
+        })
+    }
+
+    /// Completes the report with its times, and writes it.
+    fn finish_report(self, mut report: PoseReport, started: Instant) -> Result<PoseReport, RunError> {
+        report.stages = self.clock.stages;
+        report.seconds = started.elapsed().as_secs_f64();
+        let file = self.input.out.join(REPORT_FILE);
+        write_atomic(&file, |file| file.write_all(&to_json(&report)))?;
+        Ok(report)
+    }
 }
 
 /// The program that found the poses in `data`, if [`pose`] wrote the model there or added to it.

@@ -14,15 +14,15 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-/// Writes `images` and `sparse`, or replaces the model in the folder `into`, to which photographs were added. Without `into`, files of
-/// other photographs that an earlier call imported are moved to `unused`.
+/// Writes `images` and `sparse`, or replaces the model in the folder `known_model`, to which photographs were added. Without `known_model`,
+/// files of other photographs that an earlier call imported are moved to `unused`.
 pub(super) fn write(
     out: &Path,
     folder: &PhotoFolder,
     work: &Work,
     infos: &[PhotoInfo],
     found: &Reconstruction,
-    into: Option<&Path>,
+    known_model: Option<&Path>,
 ) -> Result<(), RunError> {
     let has_pose = |(photo, i): (usize, &usize)| {
         let mut models = found.models.iter();
@@ -38,11 +38,11 @@ pub(super) fn write(
         fs::create_dir_all(&to).map_err(RunError::io("create", &to))?;
         write_colmap(&to, &colmap_model(work, infos, model))?;
     }
-    match into {
+    match known_model {
         Some(model) => replace_model(out, model, &written)?,
         None => end_models(out, &written)?,
     }
-    import::record(out, &posed, into.is_some())
+    import::record(out, &posed, known_model.is_some())
 }
 
 /// An empty folder for models, beside those of an earlier call, which may be more and remain until the new ones are complete.
@@ -81,11 +81,12 @@ fn replace_model(out: &Path, model: &Path, written: &Path) -> Result<(), RunErro
     }
     for name in names {
         let (old, new) = (model.join(&name), written.join("0").join(&name));
-        match new.exists() {
-            true => fs::rename(&new, &old).map_err(RunError::io("rename", &new))?,
-            false => fs::remove_file(&old)
+        if new.exists() {
+            fs::rename(&new, &old).map_err(RunError::io("rename", &new))?;
+        } else {
+            fs::remove_file(&old)
                 .or_else(absent)
-                .map_err(RunError::io("remove", &old))?,
+                .map_err(RunError::io("remove", &old))?;
         }
     }
     fs::remove_dir_all(written).map_err(RunError::io("clear", written))

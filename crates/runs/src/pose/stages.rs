@@ -223,9 +223,10 @@ impl<'a> Work<'a> {
                 None => {
                     // A photograph may be there twice.
                     let is_repeated = photos[i + 1..].iter().any(|other| other.hash == photo.hash);
-                    let found = match is_repeated {
-                        true => self.stored.photos.get(&photo.hash).cloned(),
-                        false => self.stored.photos.remove(&photo.hash),
+                    let found = if is_repeated {
+                        self.stored.photos.get(&photo.hash).cloned()
+                    } else {
+                        self.stored.photos.remove(&photo.hash)
                     };
                     let PhotoFeatures {
                         features,

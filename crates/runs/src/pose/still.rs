@@ -57,24 +57,27 @@ pub(super) struct Masked {
 /// A still background behind some photographs.
 struct StillBackground {
     scene: StillScene,
-    /// Minimum fraction of a photograph that shows it.
-    least: f64,
+    /// Minimum fraction of a photograph that shows it, for its mask to be used.
+    min_shown_fraction: f64,
 }
 
 impl StillBackground {
     /// The background behind those of `pictures` that are in `group`, if there are enough.
-    fn of(group: &[usize], [width, height]: [u32; 2], pictures: &Pictures) -> Option<Self> {
-        let of: Vec<&Vec<u8>> = group.iter().filter_map(|photo| pictures.get(photo)).collect();
-        (of.len() >= MIN_CAMERA_PHOTOS).then(|| {
-            let scene = StillScene::from_pictures(width as usize, height as usize, &of);
-            let share: f64 = of
+    fn behind(group: &[usize], [width, height]: [u32; 2], pictures: &Pictures) -> Option<Self> {
+        let grouped: Vec<&Vec<u8>> = group.iter().filter_map(|photo| pictures.get(photo)).collect();
+        (grouped.len() >= MIN_CAMERA_PHOTOS).then(|| {
+            let scene = StillScene::from_pictures(width as usize, height as usize, &grouped);
+            let shown_sum: f64 = grouped
                 .par_iter()
                 .map(|picture| scene.segment(picture).still_fraction())
                 .collect::<Vec<_>>()
                 .iter()
                 .sum();
-            let least = MIN_SHOWN_FRACTION * share / of.len() as f64;
-            Self { scene, least }
+            let min_shown_fraction = MIN_SHOWN_FRACTION * shown_sum / grouped.len() as f64;
+            Self {
+                scene,
+                min_shown_fraction,
+            }
         })
     }
 }
@@ -159,15 +162,15 @@ pub(super) fn mask_bars_and_text(
     }
     let mut masks = BTreeMap::new();
     for photos in photos_by_camera(&attempt.matched) {
-        let some = photos
+        let examined = photos
             .iter()
             .copied()
             .step_by(photos.len().div_ceil(EXAMINED_PHOTOS))
             .collect::<Vec<_>>();
-        if some.len() < MIN_CAMERA_PHOTOS {
+        if examined.len() < MIN_CAMERA_PHOTOS {
             continue;
         }
-        let (size, pictures) = pictures(&attempt.matched, folder, &some)?;
+        let (size, pictures) = pictures(&attempt.matched, folder, &examined)?;
         let Some(still) = bar_mask(size, &pictures).or_else(|| overlay_mask(size, &pictures)) else {
             continue;
         };
@@ -256,12 +259,12 @@ fn write_and_report(
     progress: &(dyn Fn(PoseProgress) + Sync),
 ) -> Result<(PathBuf, String), RunError> {
     let written = write(out, folder, masks)?;
-    let masked: usize = (masks.values()).map(|mask| still_pixels(&mask.still)).sum();
-    let of: usize = masks.values().map(|mask| mask.still.len()).sum();
+    let masked_pixels: usize = (masks.values()).map(|mask| still_pixels(&mask.still)).sum();
+    let all_pixels: usize = masks.values().map(|mask| mask.still.len()).sum();
     let message = format!(
         "{:.0} % of the pixels of {} photographs {what}: masked in {}; to change this, put masks of your own into a folder named masks \
          beside the photographs",
-        100.0 * masked as f64 / of as f64,
+        100.0 * masked_pixels as f64 / all_pixels as f64,
         masks.len(),
         written.display()
     );
@@ -279,7 +282,7 @@ fn find_still_masks(
     masks_by_camera(matched, folder, |size, pictures| {
         let scenes: Vec<StillBackground> = groups
             .iter()
-            .filter_map(|group| StillBackground::of(group, size, pictures))
+            .filter_map(|group| StillBackground::behind(group, size, pictures))
             .collect();
         let mut masks = background_masks(&scenes, pictures);
         add_overlay(size, pictures, &mut masks);
@@ -317,23 +320,31 @@ fn turntable_masks(
             .iter()
             .take(MAX_RINGS)
             .map(|ring| ring.iter().filter_map(|photo| pictures.get(photo)).collect::<Vec<_>>())
-            .filter(|of| of.len() >= MIN_CAMERA_PHOTOS)
-            .map(|of| Backdrop::from_pictures(width as usize, height as usize, &of))
+            .filter(|of_ring| of_ring.len() >= MIN_CAMERA_PHOTOS)
+            .map(|of_ring| Backdrop::from_pictures(width as usize, height as usize, &of_ring))
             .collect();
-        let most = |picture: &[u8]| {
+        let best_backdrop = |picture: &[u8]| {
             let all = backdrops.iter().map(|backdrop| (backdrop, backdrop.mask(picture)));
             all.max_by_key(|(_, shown)| still_pixels(shown))
         };
         let masks: Vec<_> = pictures
             .par_iter()
-            .filter_map(|(photo, picture)| most(picture).map(|(backdrop, shown)| (*photo, backdrop, shown)))
+            .filter_map(|(photo, picture)| {
+                let (backdrop, shown) = best_backdrop(picture)?;
+                Some((*photo, backdrop, shown))
+            })
             .collect();
-        let half_have = |value: &dyn Fn(&Backdrop, &[bool]) -> f64, least: f64| {
-            let enough = masks.iter().filter(|(_, of, shown)| value(of, shown) >= least).count();
-            2 * enough > masks.len()
+        let half_have = |value: &dyn Fn(&Backdrop, &[bool]) -> f64, min: f64| {
+            let enough = masks
+                .iter()
+                .filter(|(_, backdrop, shown)| value(backdrop, shown) >= min);
+            2 * enough.count() > masks.len()
         };
-        let is_backdrop = half_have(&|of, shown| of.border_fraction(shown), MIN_BORDER_FRACTION)
-            && half_have(&|of, shown| f64::from(of.color_range(shown)), MIN_COLOR_RANGE);
+        let is_backdrop = half_have(&|backdrop, shown| backdrop.border_fraction(shown), MIN_BORDER_FRACTION)
+            && half_have(
+                &|backdrop, shown| f64::from(backdrop.color_range(shown)),
+                MIN_COLOR_RANGE,
+            );
         let mean = masks.iter().map(|mask| still_pixels(&mask.2)).sum::<usize>() as f64 / masks.len().max(1) as f64;
         let covers = mean > MIN_BACKDROP_FRACTION * f64::from(width * height);
         let kept = masks
@@ -348,16 +359,16 @@ fn still_pixels(mask: &[bool]) -> usize {
     mask.iter().filter(|still| **still).count()
 }
 
-/// Masks by index of the folder's photographs; `of` finds them in the reduced photographs, `[H, W, 3]`, of each camera.
+/// Masks by index of the folder's photographs; `find` finds them in the reduced photographs, `[H, W, 3]`, of each camera.
 fn masks_by_camera(
     matched: &Matched,
     folder: &PhotoFolder,
-    of: impl Fn([u32; 2], &Pictures) -> BTreeMap<usize, Vec<bool>>,
+    find: impl Fn([u32; 2], &Pictures) -> BTreeMap<usize, Vec<bool>>,
 ) -> Result<BTreeMap<usize, Mask>, RunError> {
     let mut masks = BTreeMap::new();
     for photos in photos_by_camera(matched) {
         let (size, pictures) = pictures(matched, folder, &photos)?;
-        for (photo, still) in of(size, &pictures) {
+        for (photo, still) in find(size, &pictures) {
             masks.insert(matched.work.photos()[photo], Mask { size, still });
         }
     }
@@ -387,20 +398,23 @@ fn pictures(matched: &Matched, folder: &PhotoFolder, photos: &[usize]) -> Result
 /// The pixels at which `pictures` show a background, by photograph. Of several `scenes`, such as those of rings at different heights, each
 /// photograph gets the one of which it shows most.
 fn background_masks(scenes: &[StillBackground], pictures: &Pictures) -> BTreeMap<usize, Vec<bool>> {
-    let most = |picture: &[u8]| {
+    let best_scene = |picture: &[u8]| {
         let all = scenes.iter().enumerate().map(|(i, background)| {
             let shown = background.scene.segment(picture);
             (i, shown.still_fraction(), shown)
         });
-        let shown = all.filter(|(i, share, _)| *share >= scenes[*i].least);
+        let shown = all.filter(|(i, share, _)| *share >= scenes[*i].min_shown_fraction);
         shown.max_by(|a, b| a.1.total_cmp(&b.1))
     };
-    let of_pictures: Vec<_> = pictures
+    let shown: Vec<_> = pictures
         .par_iter()
-        .filter_map(|(photo, picture)| most(picture).map(|(scene, _, shown)| (scene, *photo, shown.mask())))
+        .filter_map(|(photo, picture)| {
+            let (scene, _, shown) = best_scene(picture)?;
+            Some((scene, *photo, shown.mask()))
+        })
         .collect();
     let mut by_scene: BTreeMap<usize, BTreeMap<usize, Vec<bool>>> = BTreeMap::new();
-    for (scene, photo, still) in of_pictures {
+    for (scene, photo, still) in shown {
         by_scene.entry(scene).or_default().insert(photo, still);
     }
     let moves = |masks: &BTreeMap<usize, Vec<bool>>| {
@@ -422,16 +436,16 @@ fn file_name(photo: &PhotoEntry) -> String {
 }
 
 /// Writes one mask per photograph, at its size, into a subfolder of `out`: white where nothing is known to stand still.
-fn write(out: &Path, of: &PhotoFolder, masks: &BTreeMap<usize, Mask>) -> Result<PathBuf, RunError> {
-    let folder = out.join(MASKS_FOLDER);
-    let new = folder.with_extension("new");
+fn write(out: &Path, folder: &PhotoFolder, masks: &BTreeMap<usize, Mask>) -> Result<PathBuf, RunError> {
+    let written = out.join(MASKS_FOLDER);
+    let new = written.with_extension("new");
     if new.exists() {
         fs::remove_dir_all(&new).map_err(RunError::io("clear", &new))?;
     }
     fs::create_dir_all(&new).map_err(RunError::io("create", &new))?;
     let record = new.join(RECORD_FILE);
     fs::write(&record, b"").map_err(RunError::io("write", &record))?;
-    of.photos.par_iter().enumerate().try_for_each(|(i, photo)| {
+    folder.photos.par_iter().enumerate().try_for_each(|(i, photo)| {
         let size = [photo.width, photo.height];
         let pixels = match masks.get(&i) {
             Some(mask) => mask.enlarged(size),
@@ -439,8 +453,8 @@ fn write(out: &Path, of: &PhotoFolder, masks: &BTreeMap<usize, Mask>) -> Result<
         };
         write_png(&new.join(file_name(photo)), size[0], size[1], 1, &pixels)
     })?;
-    fs::rename(&new, &folder).map_err(RunError::io("rename", &new))?;
-    Ok(folder)
+    fs::rename(&new, &written).map_err(RunError::io("rename", &new))?;
+    Ok(written)
 }
 
 impl Mask {

@@ -335,9 +335,10 @@ fn planted(clean: &GaussianCloud, cameras: &[Camera]) -> GaussianCloud {
                 _ => (0.1, ball(0.004, 0.02), opacity),
             };
             let (along, scales, opacity) = planted;
-            let mean = match along > 0.0 {
-                true => eye + ray * unit * along,
-                false => middle + direction * far * 3.0,
+            let mean = if along > 0.0 {
+                eye + ray * unit * along
+            } else {
+                middle + direction * far * 3.0
             };
             // Isolated means far from everything.
             let near = clean

@@ -3,7 +3,7 @@
 use glam::{Quat, Vec3};
 use irradia_runs::formats::{DatasetFormat, DatasetOptions, Lenses, read_dataset, read_image, write_png};
 use irradia_runs::scene::{Camera, Dataset, Photo, PointCloud, Rng, View};
-use irradia_runs::synth::{Capture, Part, SceneName, Shot, SynthOptions};
+use irradia_runs::synth::{Capture, SceneName, Shot, Split, SynthOptions};
 use irradia_runs::{
     DoctorInput, Finding, KnownDistance, Mapper, PoseInput, PoseProgress, PoseReport, RunError, check_poses, doctor,
     pose,
@@ -30,7 +30,7 @@ pub(crate) const OPTIONS: SynthOptions = SynthOptions {
 pub(crate) fn photographs(folder: &Path) -> Vec<(String, Camera)> {
     let capture = Capture::new(&OPTIONS).unwrap();
     let scene = OPTIONS.scene.build(OPTIONS.seed).0;
-    let shots = capture.shots().iter().filter(|shot| shot.part == Part::Train);
+    let shots = capture.shots().iter().filter(|shot| shot.split == Split::Train);
     shots
         .enumerate()
         .map(|(i, shot)| {
@@ -76,7 +76,7 @@ pub(crate) fn views_of(scene: SceneName) -> Vec<View> {
         };
         View::new(shot.name(), shot.camera, Arc::new(photo))
     };
-    let shots = capture.shots().iter().filter(|shot| shot.part == Part::Train);
+    let shots = capture.shots().iter().filter(|shot| shot.split == Split::Train);
     shots.map(view).collect()
 }
 
@@ -481,7 +481,7 @@ fn a_fisheye_is_found_without_metadata_and_photographs_are_added_to_it() {
     let scene = options.scene.build(options.seed).0;
     let [first, more, out] = ["first", "more", "data"].map(|name| folder.path().join(name));
     let mut truth = 0.0;
-    let shots = capture.shots().iter().filter(|shot| shot.part == Part::Train);
+    let shots = capture.shots().iter().filter(|shot| shot.split == Split::Train);
     for (i, shot) in shots.enumerate() {
         let k = shot.camera.intrinsics;
         truth = f64::from(k.fx);
@@ -532,7 +532,7 @@ fn panoramas_in_folders_are_posed_by_their_faces() {
     for (i, shot) in capture
         .shots()
         .iter()
-        .filter(|shot| shot.part == Part::Train)
+        .filter(|shot| shot.split == Split::Train)
         .enumerate()
     {
         let (part, stem) = (["first", "second"][i % 2], format!("{i:02}"));
@@ -608,6 +608,23 @@ fn panoramas_in_folders_are_posed_by_their_faces() {
         ..PoseInput::new(&photos, &out)
     };
     assert!(pose_silently(&into).unwrap_err().to_string().contains("panoramas"));
+}
+
+#[test]
+fn options_that_exclude_each_other_are_rejected_before_anything_is_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut input = PoseInput::new(folder.path().join("none"), folder.path().join("out"));
+    input.mapper = Mapper::Colmap;
+    input.into = true;
+    let error = pose_silently(&input).unwrap_err().to_string();
+    assert!(error.contains("cannot add photographs"), "{error}");
+    input.into = false;
+    input.distances.push(KnownDistance {
+        photos: ["a.jpg", "b.jpg"].map(str::to_owned),
+        metres: 1.0,
+    });
+    let error = pose_silently(&input).unwrap_err().to_string();
+    assert!(error.contains("are not scaled") && !input.out.exists(), "{error}");
 }
 
 #[cfg(unix)]

@@ -2,6 +2,7 @@
 
 use crate::{begin, dataset, folder, scene, unwatched};
 use irradia_runs::prelude::*;
+use irradia_runs::train::EndReason;
 use std::fs;
 use std::time::{Duration, Instant};
 
@@ -67,7 +68,7 @@ fn a_stopped_run_is_saved_and_resumes_to_the_bytes_of_an_uninterrupted_one() {
     let folder = folder();
     let mut run = begin(folder.path(), "run", 12);
     let reason = run.train(&mut [&mut SignalAt::new(5, Signal::Stop)]).expect("trains");
-    assert_eq!((reason.as_str(), run.trainer().clock.step), ("stopped", 5));
+    assert_eq!((reason, run.trainer().clock.step), (EndReason::Stopped, 5));
     let finished = run.finish().expect("finishes");
     assert!(!finished.complete && finished.report.steps == 5);
     let path = finished.folder.path().to_owned();
@@ -156,7 +157,7 @@ fn a_paused_run_can_be_stopped() {
         then: Signal::Stop,
         steps: Vec::new(),
     };
-    assert_eq!(run.train(&mut [&mut pauses]).expect("trains"), "stopped");
+    assert_eq!(run.train(&mut [&mut pauses]).expect("trains"), EndReason::Stopped);
     assert_eq!(pauses.steps, [1, 2, 3]);
     assert!(run.folder().file("checkpoints/step_3.safetensors").is_file());
 }

@@ -5,10 +5,9 @@
 
 use super::{Diagnosis, Evidence, GlobalRotations, average_rotations};
 use crate::Features;
-use crate::geometry::camera::DCamera;
 use crate::geometry::correspondences::sampson_squared;
 use crate::geometry::essential::{Motion, refine_motion};
-use crate::map::{FocalSource, PhotoInfo, VerifiedPair, agreement, contradictions, normalized_matches, strengths};
+use crate::map::{GroupCamera, PhotoInfo, VerifiedPair, agreement, contradictions, normalized_matches, strengths};
 use glam::{DQuat, DVec2};
 use irradia_scene::Rng;
 use rayon::prelude::*;
@@ -44,7 +43,7 @@ pub struct Consistency {
 pub fn consistency(
     photos: &[PhotoInfo],
     features: &[Features],
-    cameras: &[(DCamera, FocalSource)],
+    cameras: &[GroupCamera],
     pairs: &[VerifiedPair],
 ) -> Consistency {
     const MAX_ROUNDS: usize = 3;
@@ -61,7 +60,7 @@ pub fn consistency(
                 if averaged.disagreement[i] < MIN_DISAGREEMENT_RADIANS {
                     return (1.0, None);
                 }
-                let camera = |photo: u32| &cameras[photos[photo as usize].group].0;
+                let camera = |photo: u32| &cameras[photos[photo as usize].group].camera;
                 let points = normalized_matches(pair, features, pair.photos.map(camera));
                 motion_near_prediction(&points, b.inverse() * a, i as u64)
             })

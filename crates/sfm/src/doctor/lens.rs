@@ -94,7 +94,7 @@ pub(super) fn cropped(evidence: &Evidence) -> Vec<Diagnosis> {
 /// Cameras for which any focal length fits.
 pub(super) fn focal_unknown(evidence: &Evidence) -> Vec<Diagnosis> {
     let mut found = Vec::new();
-    for (group, (_, source)) in evidence.cameras.iter().enumerate() {
+    for (group, camera) in evidence.cameras.iter().enumerate() {
         let held = evidence
             .model()
             .is_some_and(|model| model.focal_held.get(group) == Some(&true));
@@ -108,7 +108,7 @@ pub(super) fn focal_unknown(evidence: &Evidence) -> Vec<Diagnosis> {
         };
         let general = pairs().filter(|pair| pair.kind == PairKind::General).count();
         let is_undetermined =
-            *source == FocalSource::Guess && (general as f64) < MIN_GENERAL_FRACTION * pairs().count() as f64;
+            camera.source == FocalSource::Guess && (general as f64) < MIN_GENERAL_FRACTION * pairs().count() as f64;
         // Many photographs of a scene with depth together may determine what single pairs leave open.
         let determined = || {
             let model = evidence.model().filter(|model| model.cameras[group].is_some());

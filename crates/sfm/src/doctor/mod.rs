@@ -22,9 +22,8 @@ pub use rotation_averaging::{GlobalRotations, average_rotations};
 pub use shots::{Shot, shots};
 pub use types::{Diagnosis, Kind};
 
-use crate::geometry::camera::DCamera;
 use crate::map::{
-    FocalSource, LeftOut, MissingMatches, Model, PairKind, PhotoInfo, Reason, StillRegion, VerifiedPair, Zoom, rigs,
+    GroupCamera, LeftOut, MissingMatches, Model, PairKind, PhotoInfo, Reason, StillRegion, VerifiedPair, Zoom, rigs,
 };
 use crate::{Features, PairMatches, connected_components};
 use std::collections::BTreeMap;
@@ -46,8 +45,8 @@ pub struct Evidence<'a> {
     pub masked: Option<&'a StillRegion>,
     /// Pairs after verification.
     pub pairs: &'a [VerifiedPair],
-    /// `[groups]` the camera of each group before any adjustment, and where its focal length comes from.
-    pub cameras: &'a [(DCamera, FocalSource)],
+    /// `[groups]` the camera of each group before any adjustment.
+    pub cameras: &'a [GroupCamera],
     /// The models, largest first, if the photographs were mapped.
     pub models: &'a [Model],
     /// Focal lengths that are not in the metadata and that the mapper found.
@@ -162,9 +161,10 @@ pub fn diagnose(evidence: &Evidence) -> Vec<Diagnosis> {
         Some(_) => ring::ring(evidence, &graph, &[]),
         None => {
             let found = consistency(evidence.photos, evidence.features, evidence.cameras, evidence.pairs);
-            match found.is_consistent() {
-                true => ring::ring(evidence, &graph, &found.rotations.world_from_camera),
-                false => Vec::new(),
+            if found.is_consistent() {
+                ring::ring(evidence, &graph, &found.rotations.world_from_camera)
+            } else {
+                Vec::new()
             }
         }
     };

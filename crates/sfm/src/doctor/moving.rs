@@ -13,7 +13,7 @@ use crate::geometry::essential::cross_matrix;
 use crate::geometry::fundamental::Fundamental;
 use crate::geometry::homography::Homography;
 use crate::geometry::ransac::estimate;
-use crate::map::{MAX_INLIER_ERROR, centered_points, pairs_with_value, ransac_limits};
+use crate::map::{MAX_INLIER_ERROR_LONG_SIDES, centered_points, pairs_with_value, ransac_limits};
 use crate::median;
 use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
@@ -112,12 +112,13 @@ fn disagrees_with_scene(pair: &PairMatches, group: &[Match], scene: &[Match]) ->
     let points = Correspondences::new(scene.iter().map(|m| m.1).collect());
     let problem = Fundamental {
         points: &points,
-        threshold: MAX_INLIER_ERROR,
+        threshold: MAX_INLIER_ERROR_LONG_SIDES,
     };
     let Some(found) = estimate(&problem, Vec::new(), ransac_limits(pair, 300)) else {
         return false;
     };
-    let agrees = |m: &&Match| sampson_squared(&found.model, m.1) < MAX_INLIER_ERROR * MAX_INLIER_ERROR;
+    let agrees =
+        |m: &&Match| sampson_squared(&found.model, m.1) < MAX_INLIER_ERROR_LONG_SIDES * MAX_INLIER_ERROR_LONG_SIDES;
     let inliers: Vec<Match> = scene.iter().filter(agrees).copied().collect();
     let enough = inliers.len() >= MIN_SCENE_MATCHES && inliers.len() as f64 >= MIN_SCENE_FRACTION * scene.len() as f64;
     let distances = group.iter().map(|m| sampson_squared(&found.model, m.1).sqrt());
@@ -134,7 +135,7 @@ fn is_parallax(pair: &PairMatches, group: &[Match], scene: &[Match], agreeing: u
     let points = Correspondences::new(scene.iter().map(|m| m.1).collect());
     let problem = Homography {
         points: &points,
-        threshold: MAX_INLIER_ERROR,
+        threshold: MAX_INLIER_ERROR_LONG_SIDES,
     };
     let Some(found) = estimate(&problem, Vec::new(), ransac_limits(pair, 500)) else {
         return false;
@@ -147,7 +148,7 @@ fn is_parallax(pair: &PairMatches, group: &[Match], scene: &[Match], agreeing: u
         .map(|(_, [a, b])| (plane * a.extend(1.0)).cross(b.extend(1.0)))
         .collect();
     let agree = |f: &DMat3, matches: &[Match]| {
-        let agrees = |m: &&Match| sampson_squared(f, m.1) < MAX_INLIER_ERROR * MAX_INLIER_ERROR;
+        let agrees = |m: &&Match| sampson_squared(f, m.1) < MAX_INLIER_ERROR_LONG_SIDES * MAX_INLIER_ERROR_LONG_SIDES;
         matches.iter().filter(agrees).count() as f64
     };
     let pairs = (0..lines.len()).flat_map(|i| (0..i).map(move |j| [i, j]));
@@ -169,12 +170,12 @@ fn fit_plane(pair: &PairMatches, matches: Vec<Match>) -> Option<(Vec<Match>, Vec
     let points = Correspondences::new(matches.iter().map(|m| m.1).collect());
     let problem = Homography {
         points: &points,
-        threshold: MAX_INLIER_ERROR,
+        threshold: MAX_INLIER_ERROR_LONG_SIDES,
     };
     let found = estimate(&problem, Vec::new(), ransac_limits(pair, 500))?;
     let agrees = |m: &Match| {
         let mapped = found.model * m.1[0].extend(1.0);
-        (mapped.truncate() / mapped.z - m.1[1]).length() < MAX_INLIER_ERROR
+        (mapped.truncate() / mapped.z - m.1[1]).length() < MAX_INLIER_ERROR_LONG_SIDES
     };
     let (group, left): (Vec<Match>, Vec<Match>) = matches.into_iter().partition(agrees);
     (group.len() >= MIN_OBJECT_MATCHES).then_some((group, left))

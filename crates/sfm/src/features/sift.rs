@@ -106,12 +106,11 @@ impl Sift {
             let (extremum, [x, y, scale]) = (&extrema[i], places[i]);
             let plane = &octaves[extremum.octave][extremum.level - FIRST_SCALE];
             let described = self.describe(plane, extremum);
-            let frontal = match self.frontal {
-                true => {
-                    let (patch, centre) = frontal_patch(&octaves, extremum);
-                    self.describe(&patch, &centre)
-                }
-                false => [None, None],
+            let frontal = if self.frontal {
+                let (patch, centre) = frontal_patch(&octaves, extremum);
+                self.describe(&patch, &centre)
+            } else {
+                [None, None]
             };
             for (described, frontal) in described.into_iter().zip(frontal) {
                 let Some((angle, _)) = described.or(frontal) else {

@@ -12,7 +12,7 @@ use std::collections::BTreeSet;
 /// Maximum number of matches of a pair that are examined.
 const MAX_EXAMINED_MATCHES: usize = 100;
 /// Maximum error of a match that agrees, on the plane z = 1: about eight pixels at the usual focal length.
-const MAX_INLIER_ERROR: f64 = 0.01;
+const MAX_INLIER_ERROR_ON_PLANE: f64 = 0.01;
 /// A pair contradicts the model if less than this fraction of its matches agree.
 pub(super) const MIN_CONSISTENT_FRACTION: f64 = 0.3;
 /// Distance between two cameras, in units of the model, below which their pair only turns.
@@ -42,7 +42,7 @@ pub fn agreement(
         if baseline.length() < MIN_BASELINE {
             let is_inlier = |[first, second]: &&[DVec2; 2]| {
                 let rotated: DVec3 = rotation * first.extend(1.0);
-                rotated.z > 0.0 && (rotated.truncate() / rotated.z - *second).length() < MAX_INLIER_ERROR
+                rotated.z > 0.0 && (rotated.truncate() / rotated.z - *second).length() < MAX_INLIER_ERROR_ON_PLANE
             };
             return Some(points.iter().filter(is_inlier).count() as f64 / points.len().max(1) as f64);
         }
@@ -52,7 +52,7 @@ pub fn agreement(
         };
         let essential = motion.essential();
         let agrees = |p: &&[DVec2; 2]| {
-            sampson_squared(&essential, **p) < MAX_INLIER_ERROR * MAX_INLIER_ERROR
+            sampson_squared(&essential, **p) < MAX_INLIER_ERROR_ON_PLANE * MAX_INLIER_ERROR_ON_PLANE
                 // Distant points may be triangulated just behind the cameras, so only the rays are tested: both must point the same way.
                 && (rotation * p[0].extend(1.0)).dot(p[1].extend(1.0)) > 0.0
         };

@@ -1,16 +1,17 @@
 //! The final result: an upright, centred model, and a reason for each photograph that is in no model.
 
+use super::Input;
 use super::model::GrowingModel;
-use super::types::{LeftOut, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, Reason, VerifiedPair};
+use super::types::{LeftOut, Model, ModelPoint, PairKind, PhotoInfo, Reason, VerifiedPair};
 use crate::geometry::align::Alignment;
 use crate::geometry::pose::DPose;
 use crate::upright::{survey, up};
-use crate::{Features, PairMatches, median};
+use crate::{PairMatches, median};
 use glam::{DQuat, DVec3};
 
 /// The model in its final, upright world.
-pub(super) fn finish(working: &GrowingModel, photos: &[PhotoInfo]) -> Model {
-    let mut model = extract_model(working, photos);
+pub(super) fn finish(growing: &GrowingModel, photos: &[PhotoInfo]) -> Model {
+    let mut model = extract_model(growing, photos);
     let alignment = upright(&model, photos);
     for pose in model.poses.iter_mut().flatten() {
         *pose = alignment.pose(pose);
@@ -22,33 +23,33 @@ pub(super) fn finish(working: &GrowingModel, photos: &[PhotoInfo]) -> Model {
 }
 
 /// The model in the world in which it grew.
-pub(super) fn extract_model(working: &GrowingModel, photos: &[PhotoInfo]) -> Model {
+pub(super) fn extract_model(growing: &GrowingModel, photos: &[PhotoInfo]) -> Model {
     let mut model = Model {
         cameras: Vec::new(),
-        poses: working.poses.clone(),
+        poses: growing.poses.clone(),
         points: Vec::new(),
-        focal_held: working.focal_held.clone(),
+        focal_held: growing.focal_held.clone(),
     };
-    for (group, camera) in working.cameras.iter().enumerate() {
+    for (group, camera) in growing.cameras.iter().enumerate() {
         let present = photos
             .iter()
-            .zip(&working.poses)
+            .zip(&growing.poses)
             .any(|(photo, pose)| photo.group == group && pose.is_some());
         model.cameras.push(present.then_some(*camera));
     }
-    for track in working.triangulated_tracks() {
-        let position = working.points[track].expect("listed");
-        let used: Vec<usize> = working.tracks.range(track).filter(|o| working.used[*o]).collect();
+    for track in growing.triangulated_tracks() {
+        let position = growing.points[track].expect("listed");
+        let used: Vec<usize> = growing.tracks.range(track).filter(|o| growing.used[*o]).collect();
         let errors = used
             .iter()
-            .filter_map(|o| Some(working.view_ray(*o)?.error_squared(position).sqrt()));
+            .filter_map(|o| Some(growing.view_ray(*o)?.error_squared(position).sqrt()));
         model.points.push(ModelPoint {
             position,
             error: errors.sum::<f64>() / used.len() as f64,
             track: used
                 .iter()
                 .map(|o| {
-                    let observation = working.tracks.observations[*o];
+                    let observation = growing.tracks.observations[*o];
                     (observation.photo, observation.keypoint)
                 })
                 .collect(),
@@ -87,23 +88,27 @@ fn upright(model: &Model, photos: &[PhotoInfo]) -> Alignment {
     }
 }
 
-/// Photographs that are in no model, with the reasons.
+/// Photographs that are in no model, with the reasons; `matches` are those before verification.
 pub(super) fn left_out(
-    photos: &[PhotoInfo],
-    features: &[Features],
-    pairs: &[PairMatches],
-    verified: &[VerifiedPair],
+    input: &Input,
+    matches: &[PairMatches],
     assigned: &[bool],
     failed_registrations: &[usize],
-    options: &MapOptions,
 ) -> Vec<LeftOut> {
+    let Input {
+        photos,
+        features,
+        pairs,
+        options,
+        ..
+    } = *input;
     let reason = |photo: usize| {
         let of = |photos: &[u32; 2]| photos.contains(&(photo as u32));
         let count = features[photo].keypoints.len();
         if count < options.min_inliers {
             return Reason::FewFeatures { features: count };
         }
-        let best = pairs
+        let best = matches
             .iter()
             .filter(|p| of(&p.photos))
             .map(|p| p.matches.len())
@@ -112,7 +117,7 @@ pub(super) fn left_out(
         if best < options.min_inliers {
             return Reason::FewMatches { best };
         }
-        let partners: Vec<&VerifiedPair> = verified.iter().filter(|p| of(&p.photos)).collect();
+        let partners: Vec<&VerifiedPair> = pairs.iter().filter(|p| of(&p.photos)).collect();
         if partners.is_empty() {
             return Reason::NoGeometry { best };
         }

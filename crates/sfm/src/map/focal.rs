@@ -1,11 +1,11 @@
 //! Focal lengths before any adjustment: from metadata, from pairs, or a common value.
 
-use super::types::{MapOptions, PhotoInfo};
+use super::Unverified;
+use super::types::{GroupCamera, PhotoInfo};
 use super::verify::{Cameras, UncalibratedPair, centered_points, essential_from, select};
 use crate::geometry::camera::DCamera;
 use crate::geometry::correspondences::Correspondences;
 use crate::geometry::essential::{motions, refine_motion};
-use crate::{Features, PairMatches};
 use glam::{DMat3, DVec2};
 use rayon::prelude::*;
 
@@ -60,35 +60,33 @@ pub(super) fn are_far_apart(a: f64, b: f64) -> bool {
 }
 
 /// The camera of each group.
-pub(super) fn cameras(
-    photos: &[PhotoInfo],
-    features: &[Features],
-    pairs: &[PairMatches],
-    uncalibrated: &[&UncalibratedPair],
-    options: &MapOptions,
-) -> Cameras {
+pub(super) fn cameras(unverified: &Unverified, uncalibrated: &[&UncalibratedPair]) -> Cameras {
+    let photos = unverified.photos;
     let groups = photos.iter().map(|p| p.group + 1).max().unwrap_or(0);
     (0..groups)
         .map(|group| {
             let members: Vec<&PhotoInfo> = photos.iter().filter(|p| p.group == group).collect();
             let Some(first) = members.first() else {
-                return (DCamera::centered(1, 1, 1.0), FocalSource::Guess);
+                return GroupCamera {
+                    camera: DCamera::centered(1, 1, 1.0),
+                    source: FocalSource::Guess,
+                };
             };
             let long_side = f64::from(first.width.max(first.height));
             let mut priors: Vec<f64> = members.iter().filter_map(|p| p.focal_prior_px).collect();
             priors.sort_by(f64::total_cmp);
             let prior = priors.get(priors.len() / 2).map(|prior| prior / long_side);
-            let (focal, source) = match (
-                prior,
-                estimate_focal(group, photos, features, pairs, uncalibrated, prior, options),
-            ) {
+            let (focal, source) = match (prior, estimate_focal(group, unverified, uncalibrated, prior)) {
                 (Some(prior), None) => (prior, FocalSource::Prior),
                 // The metadata of a photograph that was cropped or scaled later are wrong.
                 (_, Some(focal)) => (focal, FocalSource::Pairs),
                 (None, None) => (DEFAULT_FOCAL, FocalSource::Guess),
             };
             let focal = focal * long_side;
-            (DCamera::centered(first.width, first.height, focal), source)
+            GroupCamera {
+                camera: DCamera::centered(first.width, first.height, focal),
+                source,
+            }
         })
         .collect()
 }
@@ -100,13 +98,11 @@ pub(super) fn cameras(
 /// candidate with the lowest sum of MSAC costs wins. Pairs that any focal length fits (planes, turns) add the same cost to all.
 fn estimate_focal(
     group: usize,
-    photos: &[PhotoInfo],
-    features: &[Features],
-    pairs: &[PairMatches],
+    unverified: &Unverified,
     uncalibrated: &[&UncalibratedPair],
     prior: Option<f64>,
-    options: &MapOptions,
 ) -> Option<f64> {
+    let Unverified { photos, pairs, .. } = *unverified;
     let mut voting_pairs: Vec<&UncalibratedPair> = uncalibrated
         .iter()
         .copied()
@@ -119,7 +115,7 @@ fn estimate_focal(
         .into_iter()
         .step_by(step)
         .take(MAX_VOTING_PAIRS)
-        .map(|pair| VotingPair::new(pair, photos, features, pairs, options))
+        .map(|pair| VotingPair::new(pair, unverified))
         .collect();
     if voting_pairs.is_empty() {
         return None;
@@ -170,13 +166,13 @@ struct VotingPair {
 }
 
 impl VotingPair {
-    fn new(
-        uncalibrated: &UncalibratedPair,
-        photos: &[PhotoInfo],
-        features: &[Features],
-        pairs: &[PairMatches],
-        options: &MapOptions,
-    ) -> Self {
+    fn new(uncalibrated: &UncalibratedPair, unverified: &Unverified) -> Self {
+        let Unverified {
+            photos,
+            features,
+            pairs,
+            options,
+        } = *unverified;
         let pair = &pairs[uncalibrated.pair];
         let points = select(&centered_points(photos, features, pair), &uncalibrated.inliers);
         let step = points.len().div_ceil(MAX_VOTING_POINTS).max(1);

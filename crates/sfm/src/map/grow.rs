@@ -1,12 +1,12 @@
 //! Growing a model from a seed, photograph by photograph.
 
+use super::Input;
 use super::focal::{FocalSource, are_similar};
 use super::model::GrowingModel;
 use super::refine::Extent;
 use super::seed::seeds;
 use super::tracks::Tracks;
-use super::types::{FEW_PHOTOS, MapOptions, PhotoInfo, Progress, VerifiedPair};
-use super::verify::Cameras;
+use super::types::{FEW_PHOTOS, Progress, VerifiedPair};
 use crate::geometry::pose::DPose;
 use crate::geometry::ransac::{Estimate, Limits};
 use crate::geometry::resection::Resection;
@@ -35,22 +35,26 @@ const FOCAL_FACTORS: [f64; 17] = [
 /// Maximum number of rounds of adjustment, filtering and triangulation at the end.
 const MAX_FINAL_ROUNDS: usize = 3;
 
-/// The largest model over several seeds among photographs not yet taken; `None` if there is none.
+/// The largest model over several seeds among photographs not yet taken, from `pairs` and their `tracks`; `None` if there is none.
 ///
 /// The search ends with a seed whose model has more than half of the photographs it could reach. Two photographs with wrong focal lengths
 /// may lead to a wrong model of all photographs, which explains a third of their observations instead of nine tenths: where focal lengths
 /// are open, or end far from where they began, the model must explain most observations as well. So must a model of few photographs: a
 /// seed with wrong poses hardly finds others that disagree. The failures of the best seed are added to `failed_registrations`.
 pub(super) fn grow_model<'a>(
-    photos: &'a [PhotoInfo],
-    cameras: &Cameras,
+    input: &Input<'a>,
     pairs: &[VerifiedPair],
     tracks: &'a Tracks,
     assigned: &[bool],
     failed_registrations: &mut [usize],
-    options: &'a MapOptions,
     progress: &mut dyn FnMut(Progress),
 ) -> Option<GrowingModel<'a>> {
+    let Input {
+        photos,
+        cameras,
+        options,
+        ..
+    } = *input;
     let empty = GrowingModel::new(photos, cameras, tracks, options);
     let guessed_focals = empty.has_guessed_focals();
     let few = photos.len() <= FEW_PHOTOS;
@@ -99,9 +103,12 @@ pub(super) fn grow_model<'a>(
         let doubtful = is_doubtful(&grown);
         outcomes.push(SeedOutcome::new(&grown, doubtful));
         is_any_doubtful |= doubtful;
-        let size = |model: &GrowingModel| match is_any_doubtful {
-            true => model.used_count(),
-            false => model.registered(),
+        let size = |model: &GrowingModel| {
+            if is_any_doubtful {
+                model.used_count()
+            } else {
+                model.registered()
+            }
         };
         if grown.registered() >= options.min_model_photos
             && best.as_ref().is_none_or(|(best, _)| size(&grown) > size(best))

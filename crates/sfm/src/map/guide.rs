@@ -7,7 +7,7 @@
 use super::focal::FocalSource;
 use super::model::GrowingModel;
 use super::tracks::Tracks;
-use super::types::{KnownGeometry, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, VerifiedPair};
+use super::types::{GroupCamera, KnownGeometry, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, VerifiedPair};
 use super::verify::inverse_calibration;
 use super::{finish, verify};
 use crate::geometry::camera::DCamera;
@@ -51,11 +51,14 @@ pub fn add_guided_points(
     let guided = guided_pairs(photos, features, model);
     let tracks = Tracks::complete(features, &[&guided, pairs].concat());
     // Groups without a camera have no photograph in the model.
-    let camera = |camera: &Option<DCamera>| (camera.unwrap_or(DCamera::centered(1, 1, 1.0)), FocalSource::Prior);
+    let camera = |camera: &Option<DCamera>| GroupCamera {
+        camera: camera.unwrap_or(DCamera::centered(1, 1, 1.0)),
+        source: FocalSource::Prior,
+    };
     let cameras: verify::Cameras = model.cameras.iter().map(camera).collect();
-    let mut working = GrowingModel::new(photos, &cameras, &tracks, options);
-    working.hold(&KnownGeometry::from(&*model));
-    let found = finish::extract_model(&working, photos).points;
+    let mut growing = GrowingModel::new(photos, &cameras, &tracks, options);
+    growing.hold(&KnownGeometry::from(&*model));
+    let found = finish::extract_model(&growing, photos).points;
     let (certain, of_two): (Vec<_>, Vec<_>) = found
         .into_iter()
         .partition(|point| point.track.len() >= MIN_CERTAIN_PHOTOS);

@@ -37,13 +37,13 @@ pub use guide::add_guided_points;
 pub use metric::{ScaleFit, scale_to_locations};
 pub use missing::{MIN_MISSING_PAIRS, missing_matches};
 pub use observable::determines_focal;
-pub(crate) use still::{MAX_INLIER_ERROR, pairs_with_value, ransac_limits};
+pub(crate) use still::{MAX_INLIER_ERROR_LONG_SIDES, pairs_with_value, ransac_limits};
 pub use still::{StillRegion, duplicate_pairs, find_still_region, moving_matches};
 pub use turntable::turntable_rings;
 pub(crate) use types::rigs;
 pub use types::{
-    FEW_PHOTOS, KnownGeometry, LeftOut, MapOptions, MissingMatches, Model, ModelPoint, PairKind, PhotoInfo, Progress,
-    Reason, Reconstruction, RigMount, VerifiedPair, Zoom,
+    FEW_PHOTOS, GroupCamera, KnownGeometry, LeftOut, MapOptions, MissingMatches, Model, ModelPoint, PairKind,
+    PhotoInfo, Progress, Reason, Reconstruction, RigMount, VerifiedPair, Zoom,
 };
 pub(crate) use verify::centered_points;
 pub use verify::{Cameras, verify};
@@ -52,17 +52,12 @@ use crate::geometry::camera::DCamera;
 use crate::{Features, PairMatches};
 use split::Split;
 use tracks::Tracks;
-use zoom::FocalDistribution;
 
 /// A model with less than this fraction of the photographs is in doubt, and is mapped again with this focal length, relative to the long
 /// side. Models of a rendered medal with a field of view of 14 degrees are correct with initial values of 2, 3, 4 and 6, and wrong from
 /// 0.5 (the value from its pairs) to 1.2.
 const MIN_TRUSTED_FRACTION: f64 = 0.8;
 const NARROW_VIEW_FOCAL: f64 = 3.0;
-/// Maximum number of zoom settings that are distinguished besides the first.
-const MAX_ZOOMS: usize = 3;
-/// Maximum mean error of a model in which each photograph has its own focal length, relative to that of the model with shared ones.
-const MAX_ERROR_RATIO: f64 = 0.8;
 
 /// Cameras, poses and points from matched features.
 ///
@@ -80,13 +75,19 @@ pub fn reconstruct(
 ) -> Reconstruction {
     assert_eq!(photos.len(), features.len(), "one set of features per photograph");
     let pairs = &still::without_still_matches(photos, features, pairs)[..];
+    let input = Unverified {
+        photos,
+        features,
+        pairs,
+        options,
+    };
     let mut known = known_cameras(photos);
-    let mut found = map_with_cameras(photos, features, pairs, &known, options, progress);
+    let mut found = map_with_cameras(&input, &known, progress);
     // The focal length that the pairs of few photographs suggest may be wrong, and so may a model that starts with it.
     if photos.len() <= FEW_PHOTOS
         && let Some(usual) = with_usual_focal(photos, &found.cameras)
     {
-        let again = map_with_cameras(photos, features, pairs, &usual, options, progress);
+        let again = map_with_cameras(&input, &usual, progress);
         if again.split_models.is_none() && model_size(&again) > model_size(&found) {
             found = again;
             known = usual;
@@ -100,7 +101,7 @@ pub fn reconstruct(
         && !zoom::is_confirmed(photos, features, &found.models)
         && let Some(narrow) = with_narrow_view(photos, &found.cameras)
     {
-        let again = map_with_cameras(photos, features, pairs, &narrow, options, progress);
+        let again = map_with_cameras(&input, &narrow, progress);
         // Parts that look alike are joined with any focal length, so contradictions decide as well.
         let contradicted = |found: &Reconstruction| found.contradictions(photos, features);
         let more = model_size(&again) > model_size(&found);
@@ -112,50 +113,19 @@ pub fn reconstruct(
     let fisheyes = found.models.first().map(|model| fisheye::find(photos, features, model));
     if let Some(fisheyes) = fisheyes.filter(|fisheyes| !fisheyes.is_empty()) {
         for (group, camera) in fisheyes {
-            known[group] = Some((camera, FocalSource::Pairs));
+            known[group] = Some(GroupCamera {
+                camera,
+                source: FocalSource::Pairs,
+            });
         }
-        let again = map_with_cameras(photos, features, pairs, &known, options, progress);
+        let again = map_with_cameras(&input, &known, progress);
         if model_size(&again) > model_size(&found) {
             found = again;
         }
     }
-    let mut grouped = photos.to_vec();
-    while found.zooms.len() < MAX_ZOOMS {
-        let clustered = match found
-            .models
-            .first()
-            .map(|m| zoom::focal_distribution(&grouped, features, m))
-        {
-            Some(FocalDistribution::Own) if found.zooms.is_empty() => {
-                let own = with_own_focals(photos, features, pairs, &found, options, progress);
-                found = own.unwrap_or(found);
-                break;
-            }
-            Some(FocalDistribution::Clustered(zoom)) => Some(zoom),
-            _ => None,
-        };
-        let Some(zoom) = clustered.or_else(|| zoom::between_models(&grouped, &found.models)) else {
-            break;
-        };
-        let mut regrouped = grouped.clone();
-        zoom.photos
-            .iter()
-            .for_each(|photo| regrouped[*photo].group = zoom.group);
-        let mut cameras: Vec<_> = found.cameras.iter().copied().map(Some).collect();
-        let lens = cameras[zoom.previous_group].expect("listed").0;
-        cameras.push(None);
-        for (group, focal) in [zoom.previous_group, zoom.group].into_iter().zip(zoom.focals) {
-            cameras[group] = Some((DCamera::centered(lens.width, lens.height, focal), FocalSource::Pairs));
-        }
-        let again = map_with_cameras(&regrouped, features, pairs, &cameras, options, progress);
-        if again.registered() < found.registered() || !zoom::is_distinct(&zoom, &again.models) {
-            break;
-        }
-        let zooms = [std::mem::take(&mut found.zooms), vec![zoom]].concat();
-        found = Reconstruction { zooms, ..again };
-        grouped = regrouped;
-    }
+    found = zoom::split_cameras(&input, found, progress);
     // Puts each photograph into the group of its own camera, where it has one.
+    let mut grouped = photos.to_vec();
     found.regroup(&mut grouped);
     if let Some(model) = principal::with_free_principal_points(&grouped, features, &found, options, progress) {
         found.models[0] = model;
@@ -169,63 +139,31 @@ pub fn reconstruct(
     found
 }
 
-/// Maps again with each photograph as its own camera, starting with the focal length of its camera in `found`; `None` unless the errors
-/// fall as much as they do where focal lengths really differ.
-fn with_own_focals(
-    photos: &[PhotoInfo],
-    features: &[Features],
-    pairs: &[PairMatches],
-    found: &Reconstruction,
-    options: &MapOptions,
-    progress: &mut dyn FnMut(Progress),
-) -> Option<Reconstruction> {
-    let shared = found.models.first()?;
-    let shared_camera = |photo: &PhotoInfo| {
-        let focal = shared.cameras[photo.group].as_ref()?.focal();
-        Some((DCamera::centered(photo.width, photo.height, focal), FocalSource::Guess))
-    };
-    let cameras: Vec<_> = photos.iter().map(shared_camera).collect();
-    let each = photos.iter().cloned().enumerate();
-    let each: Vec<PhotoInfo> = each.map(|(group, photo)| PhotoInfo { group, ..photo }).collect();
-    let own = map_with_cameras(&each, features, pairs, &cameras, options, progress);
-    let model = own.models.first()?;
-    let is_better =
-        model.registered() >= shared.registered() && model.mean_error() < MAX_ERROR_RATIO * shared.mean_error();
-    is_better.then_some(Reconstruction {
-        own_focals: true,
-        ..own
-    })
-}
-
 /// Cameras with the usual focal length, if there are no metadata and the pairs suggest another one.
-fn with_usual_focal(photos: &[PhotoInfo], cameras: &Cameras) -> Option<Vec<Option<(DCamera, FocalSource)>>> {
-    let is_guess = cameras.iter().all(|(_, source)| *source == FocalSource::Guess);
+fn with_usual_focal(photos: &[PhotoInfo], cameras: &Cameras) -> Option<Vec<Option<GroupCamera>>> {
+    let is_guess = cameras.iter().all(|of| of.source == FocalSource::Guess);
     with_guessed_focal(photos, cameras, focal::DEFAULT_FOCAL).filter(|_| !is_guess)
 }
 
 /// Cameras with a narrow field of view, if there are no metadata: all focal lengths fit the pairs of such photographs nearly equally
 /// well, and a model that starts with a much shorter one becomes flat and breaks.
-fn with_narrow_view(photos: &[PhotoInfo], cameras: &Cameras) -> Option<Vec<Option<(DCamera, FocalSource)>>> {
-    let shorter = |(camera, _): &(DCamera, FocalSource)| camera.focal() < NARROW_VIEW_FOCAL / 2.0 * camera.long_side();
+fn with_narrow_view(photos: &[PhotoInfo], cameras: &Cameras) -> Option<Vec<Option<GroupCamera>>> {
+    let shorter = |of: &GroupCamera| of.camera.focal() < NARROW_VIEW_FOCAL / 2.0 * of.camera.long_side();
     with_guessed_focal(photos, cameras, NARROW_VIEW_FOCAL).filter(|_| cameras.iter().all(shorter))
 }
 
 /// `[groups]` cameras with the focal length `focal`, relative to the long side, if there are no metadata.
-fn with_guessed_focal(
-    photos: &[PhotoInfo],
-    cameras: &Cameras,
-    focal: f64,
-) -> Option<Vec<Option<(DCamera, FocalSource)>>> {
+fn with_guessed_focal(photos: &[PhotoInfo], cameras: &Cameras, focal: f64) -> Option<Vec<Option<GroupCamera>>> {
     let has_metadata = |photo: &PhotoInfo| photo.focal_prior_px.is_some() || photo.camera.is_some();
     if photos.iter().any(has_metadata) {
         return None;
     }
-    let camera = |(camera, _): &(DCamera, FocalSource)| {
+    let camera = |GroupCamera { camera, .. }: &GroupCamera| {
         let focal = focal * camera.long_side();
-        Some((
-            DCamera::centered(camera.width, camera.height, focal),
-            FocalSource::Guess,
-        ))
+        Some(GroupCamera {
+            camera: DCamera::centered(camera.width, camera.height, focal),
+            source: FocalSource::Guess,
+        })
     };
     Some(cameras.iter().map(camera).collect())
 }
@@ -234,7 +172,7 @@ fn with_guessed_focal(
 fn is_far_from_initial_focals(found: &Reconstruction) -> bool {
     let first = found.models.first().map_or(&[][..], |model| &model.cameras);
     let mut of_both = first.iter().zip(&found.cameras);
-    of_both.any(|(camera, (began, _))| camera.is_some_and(|c| focal::are_far_apart(c.focal(), began.focal())))
+    of_both.any(|(camera, began)| camera.is_some_and(|c| focal::are_far_apart(c.focal(), began.camera.focal())))
 }
 
 /// Number of photographs and of observations in the largest model.
@@ -244,25 +182,36 @@ fn model_size(found: &Reconstruction) -> (usize, usize) {
 }
 
 /// `[groups]` the cameras that are known exactly.
-fn known_cameras(photos: &[PhotoInfo]) -> Vec<Option<(DCamera, FocalSource)>> {
+fn known_cameras(photos: &[PhotoInfo]) -> Vec<Option<GroupCamera>> {
     let groups = photos.iter().map(|photo| photo.group + 1).max().unwrap_or(0);
     let mut cameras = vec![None; groups];
     for photo in photos {
-        cameras[photo.group] = photo.camera.map(|camera| (camera, FocalSource::Prior));
+        cameras[photo.group] = photo.camera.map(exact_camera);
     }
     cameras
 }
 
+/// A camera that is known exactly.
+fn exact_camera(camera: DCamera) -> GroupCamera {
+    GroupCamera {
+        camera,
+        source: FocalSource::Prior,
+    }
+}
+
 /// Like [`reconstruct`], with the given groups, and with the cameras of some of them given.
 fn map_with_cameras(
-    photos: &[PhotoInfo],
-    features: &[Features],
-    pairs: &[PairMatches],
-    cameras: &[Option<(DCamera, FocalSource)>],
-    options: &MapOptions,
+    unverified: &Unverified,
+    cameras: &[Option<GroupCamera>],
     progress: &mut dyn FnMut(Progress),
 ) -> Reconstruction {
-    let (cameras, verified) = verify::verify_with(photos, features, pairs, cameras, options, progress);
+    let Unverified {
+        photos,
+        features,
+        pairs,
+        options,
+    } = *unverified;
+    let (cameras, verified) = verify::verify_with(unverified, cameras, progress);
     let input = Input {
         photos,
         features,
@@ -281,15 +230,7 @@ fn map_with_cameras(
         assigned,
         failed_registrations,
     } = found;
-    let left_out = finish::left_out(
-        photos,
-        features,
-        pairs,
-        &verified,
-        &assigned,
-        &failed_registrations,
-        options,
-    );
+    let left_out = finish::left_out(&input, pairs, &assigned, &failed_registrations);
     Reconstruction {
         models,
         left_out,
@@ -317,29 +258,30 @@ pub fn extend(
 ) -> Reconstruction {
     assert_eq!(photos.len(), known.poses.len(), "a pose or none per photograph");
     let pairs = &still::without_still_matches(photos, features, pairs)[..];
-    let held: Vec<_> = known
-        .cameras
-        .iter()
-        .map(|c| c.map(|c| (c, FocalSource::Prior)))
-        .collect();
-    let (cameras, verified) = verify::verify_with(photos, features, pairs, &held, options, progress);
-    assert_eq!(cameras.len(), known.cameras.len(), "a camera or none per group");
-    let tracks = Tracks::new(features, &verified);
-    let mut working = model::GrowingModel::new(photos, &cameras, &tracks, options);
-    working.hold(known);
-    let mut failed_registrations = vec![0; photos.len()];
-    working.grow(&vec![false; photos.len()], &mut failed_registrations, progress);
-    let assigned: Vec<bool> = working.poses.iter().map(Option::is_some).collect();
-    let left_out = finish::left_out(
+    let held: Vec<_> = known.cameras.iter().map(|camera| camera.map(exact_camera)).collect();
+    let unverified = Unverified {
         photos,
         features,
         pairs,
-        &verified,
-        &assigned,
-        &failed_registrations,
         options,
-    );
-    let model = finish::extract_model(&working, photos);
+    };
+    let (cameras, verified) = verify::verify_with(&unverified, &held, progress);
+    assert_eq!(cameras.len(), known.cameras.len(), "a camera or none per group");
+    let input = Input {
+        photos,
+        features,
+        cameras: &cameras,
+        pairs: &verified,
+        options,
+    };
+    let tracks = Tracks::new(features, &verified);
+    let mut growing = model::GrowingModel::new(photos, &cameras, &tracks, options);
+    growing.hold(known);
+    let mut failed_registrations = vec![0; photos.len()];
+    growing.grow(&vec![false; photos.len()], &mut failed_registrations, progress);
+    let assigned: Vec<bool> = growing.poses.iter().map(Option::is_some).collect();
+    let left_out = finish::left_out(&input, pairs, &assigned, &failed_registrations);
+    let model = finish::extract_model(&growing, photos);
     Reconstruction {
         missing: missing_matches(photos, &model),
         models: vec![model],
@@ -393,6 +335,16 @@ struct GrownModels {
     failed_registrations: Vec<usize>,
 }
 
+/// The input before verification.
+#[derive(Clone, Copy)]
+struct Unverified<'a> {
+    photos: &'a [PhotoInfo],
+    features: &'a [Features],
+    /// Matches of all pairs.
+    pairs: &'a [PairMatches],
+    options: &'a MapOptions,
+}
+
 /// The input from which models are grown.
 struct Input<'a> {
     photos: &'a [PhotoInfo],
@@ -405,28 +357,14 @@ struct Input<'a> {
 
 /// All models from the matches of `pairs`, which may be a subset of those of `input`.
 fn grow_models(input: &Input, pairs: &[VerifiedPair], progress: &mut dyn FnMut(Progress)) -> GrownModels {
-    let Input {
-        photos,
-        features,
-        cameras,
-        options,
-        ..
-    } = *input;
-    let tracks = Tracks::new(features, pairs);
+    let Input { photos, options, .. } = *input;
+    let tracks = Tracks::new(input.features, pairs);
     let mut models = Vec::new();
     let mut assigned = vec![false; photos.len()];
     let mut failed_registrations = vec![0; photos.len()];
     while models.len() < options.max_models {
-        let Some(model) = grow::grow_model(
-            photos,
-            cameras,
-            pairs,
-            &tracks,
-            &assigned,
-            &mut failed_registrations,
-            options,
-            progress,
-        ) else {
+        let Some(model) = grow::grow_model(input, pairs, &tracks, &assigned, &mut failed_registrations, progress)
+        else {
             break;
         };
         for (photo, pose) in model.poses.iter().enumerate() {

@@ -35,11 +35,11 @@ pub(super) fn with_free_principal_points(
         return None;
     }
     let tracks = Tracks::new(features, &found.pairs);
-    let mut working = GrowingModel::new(photos, &found.cameras, &tracks, options);
-    working.resume(model);
-    working.free_principal_points();
-    working.refine_fully(progress);
-    let free = finish::finish(&working, photos);
+    let mut growing = GrowingModel::new(photos, &found.cameras, &tracks, options);
+    growing.resume(model);
+    growing.free_principal_points();
+    growing.refine_fully(progress);
+    let free = finish::finish(&growing, photos);
     (free.registered() >= model.registered() && free.observations() >= model.observations()).then_some(free)
 }
 
@@ -56,9 +56,10 @@ fn cost_reduction(photos: &[PhotoInfo], features: &[Features], model: &Model, op
     for (group, camera) in model.cameras.iter().enumerate() {
         let Some(camera) = camera else { continue };
         number[group] = cameras.len();
-        let freedom = match known[group] {
-            true => Freedom::HELD,
-            false => final_freedom(camera, count[group], model.focal_held[group], options),
+        let freedom = if known[group] {
+            Freedom::HELD
+        } else {
+            final_freedom(camera, count[group], model.focal_held[group], options)
         };
         cameras.push(AdjustedCamera {
             camera: *camera,

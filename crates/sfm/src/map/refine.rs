@@ -285,9 +285,10 @@ impl GrowingModel<'_> {
         };
         let focal_held = self.focal_held[group] || count < min_photos;
         let lens = lens_freedom(&self.cameras[group], count, focal_held, full);
-        match self.principal_free && extent != Extent::Growing && !focal_held {
-            true => lens.with_principal(),
-            false => lens,
+        if self.principal_free && extent != Extent::Growing && !focal_held {
+            lens.with_principal()
+        } else {
+            lens
         }
     }
 

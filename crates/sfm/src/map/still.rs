@@ -20,7 +20,7 @@ const MAX_STILL_SHIFT: f64 = 0.002;
 /// Minimum shift of a match that certainly moves, relative to the long side.
 const MIN_MOVING_SHIFT: f64 = 0.015;
 /// Maximum error of a match that agrees with a geometry, relative to the long side: four pixels of a thousand, as in verification.
-pub(crate) const MAX_INLIER_ERROR: f64 = 0.004;
+pub(crate) const MAX_INLIER_ERROR_LONG_SIDES: f64 = 0.004;
 /// Minimum number and fraction of matches that stand still for a pair to count.
 const MIN_STILL_MATCHES: usize = 12;
 const MIN_STILL_FRACTION: f64 = 0.08;
@@ -92,13 +92,15 @@ fn still_fraction(photos: &[PhotoInfo], features: &[Features], pair: &PairMatche
     let points = Correspondences::new(moving);
     let problem = Fundamental {
         points: &points,
-        threshold: MAX_INLIER_ERROR,
+        threshold: MAX_INLIER_ERROR_LONG_SIDES,
     };
     let found = estimate(&problem, Vec::new(), ransac_limits(pair, 300))?;
     if found.inliers <= points.points.len() / 3 || found.inliers < 15 {
         return None;
     }
-    let is_outlier = |p: &&[DVec2; 2]| sampson_squared(&found.model, **p) > MAX_INLIER_ERROR * MAX_INLIER_ERROR;
+    let is_outlier = |p: &&[DVec2; 2]| {
+        sampson_squared(&found.model, **p) > MAX_INLIER_ERROR_LONG_SIDES * MAX_INLIER_ERROR_LONG_SIDES
+    };
     // Matches far away or straight ahead stand still but agree with the motion.
     let disagrees = 2 * still.iter().filter(is_outlier).count() > still.len();
     Some(disagrees.then_some(fraction))

@@ -34,6 +34,15 @@ pub struct PhotoInfo {
     pub mount: Option<RigMount>,
 }
 
+/// The camera of a group before any adjustment.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct GroupCamera {
+    /// Known exactly, or with a principal point at the centre.
+    pub camera: DCamera,
+    /// Where its focal length comes from.
+    pub source: FocalSource,
+}
+
 /// How a photograph is mounted on a rig: all photographs of a rig are taken from one position.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RigMount {
@@ -193,8 +202,8 @@ pub struct Reconstruction {
     pub left_out: Vec<LeftOut>,
     /// The pairs that were used.
     pub pairs: Vec<VerifiedPair>,
-    /// `[groups]` the camera of each group before the last mapping, and where its focal length comes from.
-    pub cameras: Vec<(DCamera, FocalSource)>,
+    /// `[groups]` the camera of each group before the last mapping.
+    pub cameras: Vec<GroupCamera>,
     /// Photographs of one group that turned out to have another focal length: each `Zoom` adds a group.
     pub zooms: Vec<Zoom>,
     /// Whether each photograph became its own group, because each has its own focal length and the metadata do not contain it.

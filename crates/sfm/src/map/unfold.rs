@@ -77,12 +77,11 @@ pub(super) fn unfold(input: &Input, found: GrownModels, progress: &mut dyn FnMut
         let agreement = model.map_or(vec![None; pairs.len()], |model| {
             agreement(photos, features, pairs, model)
         });
-        let contradicting = match few {
-            true => contradictions(pairs, &strengths, &agreement).len(),
-            false => {
-                let contradicts = |i: &&usize| agreement[**i].is_some_and(|a| a < MIN_CONSISTENT_FRACTION);
-                tree.iter().filter(contradicts).count()
-            }
+        let contradicting = if few {
+            contradictions(pairs, &strengths, &agreement).len()
+        } else {
+            let contradicts = |i: &&usize| agreement[**i].is_some_and(|a| a < MIN_CONSISTENT_FRACTION);
+            tree.iter().filter(contradicts).count()
         };
         Candidate {
             grown,

@@ -1,7 +1,8 @@
 //! Verification: which matches of a pair agree with one geometry, and the kind of this geometry.
 
+use super::Unverified;
 use super::focal::{self, FocalSource};
-use super::types::{MapOptions, PairKind, PhotoInfo, Progress, VerifiedPair};
+use super::types::{GroupCamera, MapOptions, PairKind, PhotoInfo, Progress, VerifiedPair};
 use crate::geometry::camera::DCamera;
 use crate::geometry::correspondences::{Correspondences, sampson_squared};
 use crate::geometry::essential::{Essential, Motion, closest_essential, cross_matrix, motion_in_front, refine_motion};
@@ -26,8 +27,8 @@ const GUIDED_DISTANCE_RATIO: f64 = 0.5;
 /// A pair whose median angle is below this is a rotation, radians: about three pixels for a long side of a thousand.
 const MIN_PARALLAX_RADIANS: f64 = 0.003;
 
-/// `[groups]` the camera of each group before any adjustment, and where its focal length comes from; the principal point is at the centre.
-pub type Cameras = Vec<(DCamera, FocalSource)>;
+/// `[groups]` the camera of each group before any adjustment.
+pub type Cameras = Vec<GroupCamera>;
 
 /// A pair's fundamental matrix between pixels that are centred and divided by each photograph's long side.
 #[derive(Clone, Debug)]
@@ -48,18 +49,27 @@ pub fn verify(
     options: &MapOptions,
     progress: &mut dyn FnMut(Progress),
 ) -> (Cameras, Vec<VerifiedPair>) {
-    verify_with(photos, features, pairs, &[], options, progress)
+    let unverified = Unverified {
+        photos,
+        features,
+        pairs,
+        options,
+    };
+    verify_with(&unverified, &[], progress)
 }
 
 /// Like [`verify`], with the cameras of some groups given.
 pub(super) fn verify_with(
-    photos: &[PhotoInfo],
-    features: &[Features],
-    pairs: &[PairMatches],
-    given: &[Option<(DCamera, FocalSource)>],
-    options: &MapOptions,
+    unverified: &Unverified,
+    given: &[Option<GroupCamera>],
     progress: &mut dyn FnMut(Progress),
 ) -> (Cameras, Vec<VerifiedPair>) {
+    let Unverified {
+        photos,
+        features,
+        pairs,
+        options,
+    } = *unverified;
     // If all photographs have metadata, a few pairs suffice to check them.
     let known = photos.iter().all(|p| p.focal_prior_px.is_some());
     let mut by_match_count: Vec<usize> = (0..pairs.len()).collect();
@@ -80,7 +90,7 @@ pub(super) fn verify_with(
         })
         .collect();
     let found: Vec<&UncalibratedPair> = uncalibrated.iter().flatten().collect();
-    let mut cameras = focal::cameras(photos, features, pairs, &found, options);
+    let mut cameras = focal::cameras(unverified, &found);
     for (camera, given) in cameras.iter_mut().zip(given) {
         *camera = given.unwrap_or(*camera);
     }
@@ -193,7 +203,7 @@ fn verify_calibrated(
     options: &MapOptions,
 ) -> Option<VerifiedPair> {
     let group = pair.photos.map(|p| &cameras[photos[p as usize].group]);
-    let [camera_a, camera_b]: [&DCamera; 2] = group.map(|g| &g.0);
+    let [camera_a, camera_b]: [&DCamera; 2] = group.map(|g| &g.camera);
     let plane = |camera: &DCamera, at: DVec2| {
         if camera.fisheye {
             // NaN is never an inlier.
@@ -233,7 +243,7 @@ fn verify_calibrated(
     let mut inliers = problem.inliers(&best.model);
     let mut count = inliers.iter().filter(|i| **i).count();
     let better = uncalibrated.filter(|uncalibrated| {
-        group.iter().any(|g| g.1 != FocalSource::Prior) && uncalibrated.count as f64 > 1.2 * count as f64
+        group.iter().any(|g| g.source != FocalSource::Prior) && uncalibrated.count as f64 > 1.2 * count as f64
     });
     if let Some(uncalibrated) = better {
         // The guessed focal length is off: the inliers of the fundamental matrix are used.

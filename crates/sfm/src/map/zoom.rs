@@ -10,10 +10,11 @@
 //! becomes its own camera. For four captures whose photographs were cropped to 65 to 100 % of their width and scaled back, the cost falls
 //! by 35 to 70 % and the focal lengths are 8 to 14 % from their median; for twenty unmodified captures, at most 8 % and 2.3 %.
 
-use super::focal::are_similar;
+use super::focal::{FocalSource, are_similar};
 use super::observable::determines_focal;
 use super::readjust::{self, posed};
-use super::types::{Model, PhotoInfo, Zoom};
+use super::types::{GroupCamera, Model, PhotoInfo, Progress, Reconstruction, Zoom};
+use super::{Unverified, map_with_cameras};
 use crate::adjust::{AdjustedCamera, Focal, Freedom, Prior};
 use crate::geometry::camera::DCamera;
 use crate::{Features, median};
@@ -42,9 +43,94 @@ const MIN_OWN_COST_REDUCTION: f64 = 0.25;
 const MIN_OWN_FOCAL_DEVIATION: f64 = 0.05;
 /// Cost of a change of a focal length by half, as a squared error, px^2.
 const PRIOR_COST: f64 = 10.0;
+/// Maximum number of zoom settings that are distinguished besides the first.
+const MAX_ZOOMS: usize = 3;
+/// Maximum mean error of a model in which each photograph has its own focal length, relative to that of the model with shared ones.
+const MAX_ERROR_RATIO: f64 = 0.8;
+
+/// Maps again with separate cameras for photographs that were zoomed, one setting after the other, or with a camera for each photograph;
+/// `found` where there are no such photographs, or where that is no better.
+pub(super) fn split_cameras(
+    input: &Unverified,
+    mut found: Reconstruction,
+    progress: &mut dyn FnMut(Progress),
+) -> Reconstruction {
+    let mut grouped = input.photos.to_vec();
+    while found.zooms.len() < MAX_ZOOMS {
+        let largest = found.models.first();
+        let distribution = largest.map(|model| focal_distribution(&grouped, input.features, model));
+        let clustered = match distribution {
+            Some(FocalDistribution::Own) if found.zooms.is_empty() => {
+                return with_own_focals(input, &found, progress).unwrap_or(found);
+            }
+            Some(FocalDistribution::Clustered(zoom)) => Some(zoom),
+            _ => None,
+        };
+        let Some(zoom) = clustered.or_else(|| between_models(&grouped, &found.models)) else {
+            break;
+        };
+        let mut regrouped = grouped.clone();
+        zoom.photos
+            .iter()
+            .for_each(|photo| regrouped[*photo].group = zoom.group);
+        let mut cameras: Vec<_> = found.cameras.iter().copied().map(Some).collect();
+        let lens = found.cameras[zoom.previous_group].camera;
+        cameras.push(None);
+        for (group, focal) in [zoom.previous_group, zoom.group].into_iter().zip(zoom.focals) {
+            cameras[group] = Some(GroupCamera {
+                camera: DCamera::centered(lens.width, lens.height, focal),
+                source: FocalSource::Pairs,
+            });
+        }
+        let input = Unverified {
+            photos: &regrouped,
+            ..*input
+        };
+        let again = map_with_cameras(&input, &cameras, progress);
+        if again.registered() < found.registered() || !is_distinct(&zoom, &again.models) {
+            break;
+        }
+        let zooms = [std::mem::take(&mut found.zooms), vec![zoom]].concat();
+        found = Reconstruction { zooms, ..again };
+        grouped = regrouped;
+    }
+    found
+}
+
+/// Maps again with each photograph as its own camera, starting with the focal length of its camera in `found`; `None` unless the errors
+/// fall as much as they do where focal lengths really differ.
+fn with_own_focals(
+    input: &Unverified,
+    found: &Reconstruction,
+    progress: &mut dyn FnMut(Progress),
+) -> Option<Reconstruction> {
+    let shared = found.models.first()?;
+    let shared_camera = |photo: &PhotoInfo| {
+        let focal = shared.cameras[photo.group].as_ref()?.focal();
+        Some(GroupCamera {
+            camera: DCamera::centered(photo.width, photo.height, focal),
+            source: FocalSource::Guess,
+        })
+    };
+    let cameras: Vec<_> = input.photos.iter().map(shared_camera).collect();
+    let each = input.photos.iter().cloned().enumerate();
+    let each: Vec<PhotoInfo> = each.map(|(group, photo)| PhotoInfo { group, ..photo }).collect();
+    let input = Unverified {
+        photos: &each,
+        ..*input
+    };
+    let own = map_with_cameras(&input, &cameras, progress);
+    let model = own.models.first()?;
+    let is_better =
+        model.registered() >= shared.registered() && model.mean_error() < MAX_ERROR_RATIO * shared.mean_error();
+    is_better.then_some(Reconstruction {
+        own_focals: true,
+        ..own
+    })
+}
 
 /// How the focal lengths of a model's photographs are distributed.
-pub(super) enum FocalDistribution {
+enum FocalDistribution {
     /// Photographs of one camera have one focal length.
     Shared,
     /// The photographs of one camera form two clusters: the smaller one becomes a new group.
@@ -54,7 +140,7 @@ pub(super) enum FocalDistribution {
 }
 
 /// The distribution of the focal lengths of a model's photographs when each is given its own.
-pub(super) fn focal_distribution(photos: &[PhotoInfo], features: &[Features], model: &Model) -> FocalDistribution {
+fn focal_distribution(photos: &[PhotoInfo], features: &[Features], model: &Model) -> FocalDistribution {
     let groups = model.cameras.len();
     let of_group =
         |group: usize| (0..photos.len()).filter(move |p| photos[*p].group == group && model.poses[*p].is_some());
@@ -108,7 +194,7 @@ pub(super) fn focal_distribution(photos: &[PhotoInfo], features: &[Features], mo
 
 /// Photographs of one camera that are in a separate model with another focal length: they were zoomed so far that too few pairs with the
 /// others agree with one focal length. `None` if there are none.
-pub(super) fn between_models(photos: &[PhotoInfo], models: &[Model]) -> Option<Zoom> {
+fn between_models(photos: &[PhotoInfo], models: &[Model]) -> Option<Zoom> {
     let (first, others) = models.split_first()?;
     let groups = first.cameras.len();
     let mut candidates = others
@@ -154,7 +240,7 @@ fn free_focal(model: &Model, group: usize) -> Option<f64> {
 }
 
 /// Whether the focal lengths of both cameras of `zoom` still differ enough in `models`, which were mapped with it.
-pub(super) fn is_distinct(zoom: &Zoom, models: &[Model]) -> bool {
+fn is_distinct(zoom: &Zoom, models: &[Model]) -> bool {
     let focals = [zoom.previous_group, zoom.group].map(|group| camera(models, group).map(DCamera::focal));
     match focals {
         [Some(a), Some(b)] => (b / a).ln().abs() > MIN_FOCAL_RATIO.ln(),

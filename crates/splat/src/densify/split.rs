@@ -7,8 +7,11 @@ use rayon::prelude::*;
 
 /// Factor by which the two halves of a split splat are smaller: 0.8 times 2 (Inria code).
 const RANDOM_SHRINK: f32 = 1.6;
-/// Standard deviation of a half along the split axis, relative to the original's. Two halves at distance sqrt(1 - k^2) from
-/// the centre have the original's variance for any k; at 0.6 their sum is within 5 % of the original's curve inside 2 sigma.
+/// Standard deviation of a half along the split axis, relative to the original's. Two halves at distance sqrt(1 - k^2) from the centre have
+/// the original's variance for any k. Smaller halves change the image more (the sum at the centre is 0.69 of the original's with 0.6, 0.94
+/// with 0.8), but show details sooner and cost less. Held-out PSNR at 320 pixels, 1,200 steps, with 0.5, 0.6 and 0.8: fox 33.02, 32.95,
+/// 32.94 dB; cup 30.63, 30.63, 30.76; lund_door 35.56, 35.65, 35.38; maryRose 25.33, 25.48; with 0.6 and 0.8 the mean of four captures of 7
+/// to 14 photographs 29.50, 29.67. With 0.8, steps take 1.25 times as long.
 const HALF_DEVIATION: f32 = 0.6;
 
 /// The largest standard deviation, world units.
@@ -99,7 +102,7 @@ pub(super) fn random_halves(splats: &Splats, indices: &[u32], rng: &mut Rng) -> 
 }
 
 /// Splits each of `indices` in two across its longest axis, adjacent in the result: together they have its mass, mean and
-/// covariance, so that the image hardly changes when they replace it.
+/// covariance, so that the image changes little when they replace it.
 pub(super) fn long_axis_halves(splats: &Splats, indices: &[u32]) -> Splats {
     halves(splats, indices, |splats, i, half| {
         let mut log_scales = log_scales(splats, i);

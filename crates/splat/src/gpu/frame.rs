@@ -31,44 +31,81 @@ pub(super) mod flag {
     pub const CAMERA: u32 = 256;
 }
 
+/// Sizes of the uploaded splats.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct SplatsShape {
+    /// Number of splats.
+    pub count: usize,
+    /// Stride of their planes.
+    pub stride: usize,
+    /// SH degree for which the harmonics have room.
+    pub degree: u32,
+}
+
 /// A renderer on the GPU: the twin of [`crate::Renderer`], with its conventions and formulas; sums are computed in another order.
+///
+/// The shapes of its arrays are those of their content; they have room for more. An entry is a splat in the list of a tile, and a slot is
+/// the place of that pair in the list by splats, front to back.
 pub struct GpuRenderer {
     pub(super) gpu: Arc<Gpu>,
     pub(super) kernels: Kernels,
     /// Words of `View` in `view.wgsl`.
     pub(super) view: Array,
+    /// `[GEOMETRY, stride]` f32: means, quaternions, ln scales, opacity logits.
     pub(super) geometry: Array,
+    /// `[coefficients, 3, stride]` f32: SH coefficients.
     pub(super) harmonics: Array,
+    /// `[stride]` f32: variances of the splats' 3D smoothing filter, world units squared; empty without a filter.
     pub(super) filter: Array,
-    /// Number of splats, stride of their planes, SH degree.
-    pub(super) shape: [usize; 3],
+    pub(super) shape: SplatsShape,
     /// Whether splats are convolved with `filter`.
     pub(crate) filters: bool,
+    /// `[splats, 12]` f32: x, y, a, b, c, log2 of the opacity, red, green, blue, depth, half width and half height of the bounding box;
+    /// valid for visible splats.
     pub(super) footprints: Array,
+    /// `[splats]` u32: 1 for visible splats, else 0.
     pub(super) visible: Array,
+    /// `[splats]` u32: number of tiles that each touches; 0 for those that are not visible.
     pub(super) touched: Array,
+    /// `[4]` u32: numbers of visible splats, of entries, and of splats whose gradient is not finite; the last word is unused.
     pub(super) found: Array,
+    /// `[visible]` u32: the visible splats, first ascending, then front to back.
     pub(super) order: Array,
+    /// `[visible]` u32: the first slot of each visible splat, front to back.
     pub(super) firsts: Array,
+    /// `[entries]` u32: the slot of each entry, first ascending, then tile by tile, front to back.
     pub(super) slots: Array,
+    /// `[entries]` u32: the splat of each slot.
     pub(super) splat_of_slot: Array,
+    /// `[tiles + 1, 2]` u32: where each tile's entries begin and end in `slots`; the last range is that of entries without a tile.
     pub(super) ranges: Array,
+    /// `[tiles + 1]` u32: the first segment of each tile, then the number of segments.
     pub(super) first_segments: Array,
+    /// `[segments]` u32: the tile of each segment, in training.
     pub(super) tile_of_segment: Array,
+    /// `[tiles]` u32: number of segments of each tile that some pixel needs, in training.
     pub(super) reached: Array,
+    /// `[segments, 5, TILE * TILE]` f32: red, green, blue, depth and transmittance of a tile's pixels before each of its segments but the
+    /// first, in training.
     pub(super) states: Array,
+    /// `[FRAME_PLANES, H, W]` f32: red, green, blue, alpha, depth.
     pub(super) planes: Array,
-    /// Place of each visible splat among the visible ones: first in their own order, then front to back.
+    /// `[splats]` u32: place of each visible splat among the visible ones, first in their own order, then front to back.
     pub(super) places: Array,
+    /// `[visible]` u32: bits of the depths of the splats in `order`, by which these are sorted.
     depths: Array,
+    /// `[visible]` u32: number of tiles that each visible splat touches, front to back.
     counts: Array,
+    /// `[entries]` u32: the tile of each slot; sorted, that of each entry.
     tiles: Array,
+    /// `[tiles + 1]` u32: number of segments of each tile; 0 for entries without a tile.
     segment_counts: Array,
     scan: Scan,
+    /// Parameters of the prefix sums of `visible`, of `counts` and of `segment_counts`.
     scan_params: [Array; 3],
     sort_depths: Sort,
     sort_tiles: Sort,
-    /// Numbers of visible splats and of entries, each in its own part of `all_counted`.
+    /// `[1]` u32 each: numbers of visible splats and of entries if there is room for these, else 0; parts of `all_counted`.
     counted: [Array; 2],
     all_counted: Array,
     /// Number of tile entries for which there is room.
@@ -77,6 +114,7 @@ pub struct GpuRenderer {
     pub(super) last: Option<Last>,
     /// Non-finite gradients that a void frame reported: its repetition counts from zero again.
     void_non_finite: usize,
+    /// `planes` on the host, once they are read.
     host: OnceLock<Vec<f32>>,
 }
 
@@ -129,7 +167,7 @@ impl GpuRenderer {
             geometry: array("geometry"),
             harmonics: array("harmonics"),
             filter: array("filter"),
-            shape: [0; 3],
+            shape: SplatsShape::default(),
             filters: false,
             footprints: array("footprints"),
             visible: array("visible splats"),
@@ -176,15 +214,19 @@ impl GpuRenderer {
     pub fn upload(&mut self, splats: &Splats, filter: &[f32]) {
         self.harmonics.reserve(&self.gpu, splats.sh.as_slice().len());
         self.harmonics.write(&self.gpu, 0, splats.sh.as_slice());
-        self.upload_geometry(splats, filter, splats.sh_degree() as usize);
+        self.upload_geometry(splats, filter, splats.sh_degree());
         self.filters = !filter.is_empty();
         self.last = None;
     }
 
     /// Uploads everything but the harmonics, whose array has room for `degree`.
-    pub(super) fn upload_geometry(&mut self, splats: &Splats, filter: &[f32], degree: usize) {
+    pub(super) fn upload_geometry(&mut self, splats: &Splats, filter: &[f32], degree: u32) {
         let (gpu, stride) = (&self.gpu, splats.stride());
-        self.shape = [splats.len(), stride, degree];
+        self.shape = SplatsShape {
+            count: splats.len(),
+            stride,
+            degree,
+        };
         self.geometry.reserve(gpu, GEOMETRY * stride);
         write_geometry(gpu, &self.geometry, 0, splats);
         self.filter.reserve(gpu, filter.len());
@@ -243,7 +285,7 @@ impl GpuRenderer {
     /// enough workgroups are dispatched for that many. [`Self::finish_frame`] must follow.
     pub(super) fn draw(&mut self, view: &ViewParams, options: &RenderOptions, trains: bool) {
         let gpu = self.gpu.clone();
-        let [count, ..] = self.shape;
+        let count = self.shape.count;
         self.host = OnceLock::new();
         // One entry per splat to begin with, which takes little memory.
         self.room = self.room.max(count);
@@ -294,13 +336,13 @@ impl GpuRenderer {
                 &self.touched,
                 &self.found,
             ],
-            groups(self.shape[0]),
+            groups(self.shape.count),
         );
     }
 
     /// Builds the lists of all tiles, front to back, from the footprints, and the segments of these lists.
     pub(super) fn bin(&mut self, work: &mut Work, last: &Last) {
-        let [count, ..] = self.shape;
+        let count = self.shape.count;
         let tiles = last.tile_count();
         self.scan
             .run(work, &self.scan_params[0], &self.visible, &self.places, count);
@@ -411,7 +453,7 @@ impl GpuRenderer {
 
     /// SH degree for which the harmonics have room.
     pub(crate) fn sh_degree(&self) -> u32 {
-        self.shape[2] as u32
+        self.shape.degree
     }
 
     /// Pixels of the last frame.
@@ -439,7 +481,7 @@ impl GpuRenderer {
         let Last {
             view, options, trains, ..
         } = last;
-        let [count, stride, degree] = self.shape;
+        let SplatsShape { count, stride, degree } = self.shape;
         let mut floats = Vec::with_capacity(28);
         for (row, t) in view.rotation.iter().zip(view.translation) {
             floats.extend(row.iter().chain([&t]).map(|v| *v as f32));
@@ -469,7 +511,7 @@ impl GpuRenderer {
             tiles_y,
             count as u32,
             stride as u32,
-            options.sh_degree.min(degree as u32),
+            options.sh_degree.min(degree),
             drawn as u32,
             0,
             0,

@@ -49,7 +49,7 @@ fn is_unmoved(numbers: &Planes) -> bool {
 impl GpuTraining {
     /// The state with row numbers for harmonics and moments. Second moments have no planes, since they move like the first ones.
     pub fn download_numbered(&self) -> SplatState {
-        let count = self.renderer.shape[0];
+        let count = self.renderer.shape.count;
         let mut state = SplatState {
             splats: Splats {
                 sh: numbered(count),
@@ -67,21 +67,21 @@ impl GpuTraining {
 
     /// Applies an edited state of [`Self::download_numbered`].
     pub fn upload_numbered(&mut self, state: &SplatState) {
-        let [before, stride_before, degree] = self.renderer.shape;
+        let before = self.renderer.shape;
         let columns = [&state.splats.sh].into_iter().chain(state.moments[0].columns());
         let columns: Vec<&Planes> = columns.collect();
-        if state.len() != before || !columns.iter().all(|column| is_unmoved(column)) {
-            self.move_rows(&columns, [state.len(), state.splats.stride(), stride_before]);
+        if state.len() != before.count || !columns.iter().all(|column| is_unmoved(column)) {
+            self.move_rows(&columns, [state.len(), state.splats.stride(), before.stride]);
         }
         self.renderer
-            .upload_geometry(&state.splats, state.filter.plane(0), degree);
+            .upload_geometry(&state.splats, state.filter.plane(0), before.degree);
         self.upload_statistics(state);
     }
 
     /// Moves the rows of harmonics and moments; `columns` are the row numbers of the harmonics, then of the moments' five columns.
     fn move_rows(&mut self, columns: &[&Planes], [count, stride, stride_before]: [usize; 3]) {
         let gpu = self.renderer.gpu.clone();
-        let planes_of_harmonics = 3 * sh::coefficients(self.renderer.shape[2] as u32);
+        let planes_of_harmonics = 3 * sh::coefficients(self.renderer.shape.degree);
         let Moves { numbers, spare } = &mut self.moves;
         numbers.reserve(&gpu, columns.len() * stride);
         for (i, column) in columns.iter().enumerate() {

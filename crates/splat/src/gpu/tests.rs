@@ -469,9 +469,10 @@ fn density_control_with_harmonics_on_the_device_gives_the_same_bits_as_the_whole
         let [on_device, whole] = [true, false].map(|stays| {
             *engine.state_mut() = SplatState::new(splats.clone());
             train(&mut engine);
-            match stays {
-                true => engine.edit_density(edit),
-                false => edit(engine.state_mut()),
+            if stays {
+                engine.edit_density(edit);
+            } else {
+                edit(engine.state_mut());
             }
             let edited = engine.state().clone();
             assert!(stays || edited.moments[1].sh.as_slice().iter().any(|v| *v > 0.0) || edited.is_empty());
@@ -517,9 +518,10 @@ fn a_step_without_room_changes_nothing_and_its_repetition_is_that_of_a_step_that
     let [ahead, waits] = &mut engines;
     let before = ahead.state().clone();
     let step = |engine: &mut Engine, ahead: bool| {
-        match ahead {
-            true => engine.render_ahead(&camera, &RenderOptions::default()),
-            false => engine.render(camera.into(), &RenderOptions::default()),
+        if ahead {
+            engine.render_ahead(&camera, &RenderOptions::default());
+        } else {
+            engine.render(camera.into(), &RenderOptions::default());
         }
         engine.backward(&OutputGradient::of_color(&v_color));
         engine.update(&update);

@@ -1,6 +1,6 @@
 //! Splats in training on the GPU: their state, the backward pass and the update.
 
-use super::frame::{FRAME_PLANES, GEOMETRY, GpuRenderer, Last, flag, read_geometry, write_geometry};
+use super::frame::{FRAME_PLANES, GEOMETRY, GpuRenderer, Last, SplatsShape, flag, read_geometry, write_geometry};
 use super::moves::Moves;
 use crate::engine::Update;
 use crate::regularize::{Regularized, size_limit};
@@ -91,7 +91,7 @@ impl GpuTraining {
     pub fn max_splats(&self, degree: u32) -> usize {
         let words = (self.renderer.gpu.info().largest_array / 4) as usize;
         let by_state = words / (3 * sh::coefficients(degree)).max(2 * GEOMETRY);
-        let [count, ..] = self.renderer.shape;
+        let count = self.renderer.shape.count;
         let by_entries = match 2 * self.renderer.intersections() {
             0 => usize::MAX,
             entries => (words / SUMS).saturating_mul(count) / entries,
@@ -126,8 +126,8 @@ impl GpuTraining {
     /// Reads back the whole state.
     pub fn download(&self) -> SplatState {
         let gpu = &self.renderer.gpu;
-        let [count, _, degree] = self.renderer.shape;
-        let zeros = || Splats::zeros(count, degree as u32);
+        let SplatsShape { count, degree, .. } = self.renderer.shape;
+        let zeros = || Splats::zeros(count, degree);
         let mut state = SplatState {
             splats: zeros(),
             moments: [zeros(), zeros()],
@@ -145,7 +145,7 @@ impl GpuTraining {
     /// Reads the columns on which density control depends: geometry, statistics and filter.
     pub(super) fn download_density_columns(&self, state: &mut SplatState) {
         let gpu = &self.renderer.gpu;
-        let count = self.renderer.shape[0];
+        let count = self.renderer.shape.count;
         read_geometry(gpu, &self.renderer.geometry, 0, &mut state.splats);
         state.statistics = Planes::zeros(SplatState::STATISTICS, count);
         self.statistics.read(gpu, 0, state.statistics.as_mut_slice());
@@ -154,7 +154,7 @@ impl GpuTraining {
     }
 
     pub fn len(&self) -> usize {
-        self.renderer.shape[0]
+        self.renderer.shape.count
     }
 
     pub fn render(&mut self, view: &ViewParams, options: &RenderOptions) {
@@ -215,7 +215,7 @@ impl GpuTraining {
             (of.camera, flag::CAMERA),
         ];
         let more = flags(&bits);
-        let [count, ..] = renderer.shape;
+        let count = renderer.shape.count;
         if of.camera {
             self.v_camera.reserve(&gpu, CAMERA_COMPONENTS * count);
         }
@@ -273,7 +273,7 @@ impl GpuTraining {
                 &renderer.found,
                 &self.v_camera,
             ],
-            renderer.shape[0].div_ceil(VJP_GROUP),
+            renderer.shape.count.div_ceil(VJP_GROUP),
         );
     }
 
@@ -318,14 +318,14 @@ impl GpuTraining {
     /// Reads back the gradients of the last backward pass; those of the harmonics are computed here from those of colours.
     pub fn read_gradients(&self, gradients: &mut SplatGradients) {
         let gpu = &self.renderer.gpu;
-        let [count, stride, degree] = self.renderer.shape;
+        let SplatsShape { count, stride, degree } = self.renderer.shape;
         let last = self.renderer.last.as_ref().expect("render comes first");
-        gradients.splats = Splats::zeros(count, degree as u32);
+        gradients.splats = Splats::zeros(count, degree);
         read_geometry(gpu, &self.v_splats, 0, &mut gradients.splats);
         let (mut v_color, mut means) = (vec![0.0f32; 3 * stride], vec![0.0f32; 3 * stride]);
         self.v_splats.read(gpu, GEOMETRY * stride, &mut v_color);
         self.renderer.geometry.read(gpu, 0, &mut means);
-        let used = (degree as u32).min(last.options.sh_degree);
+        let used = degree.min(last.options.sh_degree);
         for i in 0..count {
             let mean = [0, 1, 2].map(|c| means[c * stride + i]);
             let basis = basis_at(used, mean, last.view.center());
@@ -357,7 +357,7 @@ impl GpuTraining {
         let renderer = &self.renderer;
         let gpu = &renderer.gpu;
         self.update.write(gpu, 0, &words);
-        let groups = renderer.shape[0].div_ceil(WORKGROUP_SIZE as usize);
+        let groups = renderer.shape.count.div_ceil(WORKGROUP_SIZE as usize);
         let mut work = Work::new(gpu);
         work.run(
             &renderer.kernels.update_harmonics,
@@ -391,16 +391,17 @@ impl GpuTraining {
     }
 
     fn update_words(&self, update: &Update, size: [u32; 2]) -> [u32; UPDATE_WORDS] {
-        let [count, stride, degree] = self.renderer.shape;
+        let SplatsShape { count, stride, degree } = self.renderer.shape;
         let step = &update.optimizer.step;
         let rate = |rate| step.device_rate(rate);
         let rates = &update.rates;
         let regularizers = &update.regularizers;
         let is_regularized = !regularizers.is_zero();
         let all = is_regularized && update.regularized == Regularized::All;
-        let limit = match update.trained_fraction < 1.0 {
-            true => self.freeze_threshold(update.trained_fraction),
-            false => None,
+        let limit = if update.trained_fraction < 1.0 {
+            self.freeze_threshold(update.trained_fraction)
+        } else {
+            None
         };
         let noise = update.noise;
         let bits = [
@@ -435,12 +436,12 @@ impl GpuTraining {
             (noise.seed as u32) ^ (noise.step as u32).wrapping_mul(0x9e37_79b9)
         });
         let span = update.condition_cap.map_or(0.0, |limit| 0.5 * limit.max(1.0).ln());
-        let coefficients = sh::coefficients(update.sh_degree.min(degree as u32));
+        let coefficients = sh::coefficients(update.sh_degree.min(degree));
         let integers = [
             count as u32,
             stride as u32,
             coefficients as u32,
-            3 * sh::coefficients(degree as u32) as u32,
+            3 * sh::coefficients(degree) as u32,
             flags(&bits),
             seed,
             span.to_bits(),
@@ -457,7 +458,7 @@ impl GpuTraining {
     /// The size below which splats are frozen: all but the largest `fraction` of the visible ones, as in `regularize::freeze_small`.
     fn freeze_threshold(&self, fraction: f32) -> Option<f32> {
         let gpu = &self.renderer.gpu;
-        let [count, stride, _] = self.renderer.shape;
+        let SplatsShape { count, stride, .. } = self.renderer.shape;
         let mut scales = vec![0.0f32; 3 * stride];
         self.renderer.geometry.read(gpu, 7 * stride, &mut scales);
         let visible: Vec<u32> = self.renderer.visible.to_vec(gpu, count);

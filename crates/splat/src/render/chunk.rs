@@ -12,6 +12,12 @@ use crate::Splats;
 use irradia_compute::simd::{Kernel, Lanes, Mask, Simd};
 use irradia_compute::unroll;
 
+/// Rows that are kept of the footprints of a chunk, in this order: x, y, a, b, c, log2 of the opacity, depth, and the half width and half
+/// height of the bounding box.
+const FOOTPRINT_ROWS: usize = 9;
+/// Rows that the backward pass takes from the footprints of a vector, in this order: a, b, c, log2 of the opacity, red, green, blue.
+const SHOWN_ROWS: usize = 7;
+
 #[inline(always)]
 fn load_geometry<S: Simd>(simd: S, splats: &Splats, at: usize) -> Geometry<S::F>
 where
@@ -106,8 +112,7 @@ impl ProjectPart<'_, '_> {
         let job = &mut self.jobs[job];
         let base = job.chunk * CHUNK;
         let mut harmonics = Harmonics::new(degree);
-        // The fields of the footprints, one row each.
-        let mut columns = [[0.0f32; CHUNK]; 9];
+        let mut rows = [[0.0f32; CHUNK]; FOOTPRINT_ROWS];
         let mut visible_bits = [0u32; CHUNK / 4];
         job.depth_keys.fill(u32::MAX);
         for at in (0..job.footprints.len()).step_by(S::LANES) {
@@ -133,7 +138,7 @@ impl ProjectPart<'_, '_> {
             let [a, b, c] = quadratic(conic);
             let log2_opacity = opacity.map(f32::log2);
             let values = [xy[0], xy[1], a, b, c, log2_opacity, depth, extent[0], extent[1]];
-            for (to, value) in columns.iter_mut().zip(values) {
+            for (to, value) in rows.iter_mut().zip(values) {
                 value.store(&mut to[at..]);
             }
         }
@@ -144,13 +149,14 @@ impl ProjectPart<'_, '_> {
         for at in harmonics.starts() {
             // Splats that are not finite are not drawn; the file reader and the optimiser report them.
             let mut finite = simd.splat(0.0).le(simd.splat(0.0));
-            for column in columns.iter().chain(&colors) {
-                finite = finite.and(simd.load(&column[at..]).abs().le(largest));
+            for row in rows.iter().chain(&colors) {
+                finite = finite.and(simd.load(&row[at..]).abs().le(largest));
             }
-            let [x, y, a, b, c, log2_opacity, _, ex, ey] = unroll!(i in 9 => simd.load(&columns[i][at..]));
+            let [x, y, a, b, c, log2_opacity, _, half_width, half_height] =
+                unroll!(row in 9 => simd.load(&rows[row][at..]));
             let outline = Outline {
                 xy: [x, y],
-                extent: [ex, ey],
+                extent: [half_width, half_height],
                 quadratic: [a, b, c],
                 log2_opacity,
             };
@@ -161,14 +167,14 @@ impl ProjectPart<'_, '_> {
                 let lane = bits.trailing_zeros() as usize;
                 bits &= bits - 1;
                 let i = at + lane;
-                let v = unroll!(k in 9 => columns[k][i]);
+                let [x, y, a, b, c, log2_opacity, depth, half_width, half_height] = unroll!(row in 9 => rows[row][i]);
                 let mut footprint = Footprint2d {
-                    xy: [v[0], v[1]],
-                    quadratic: [v[2], v[3], v[4]],
-                    log2_opacity: v[5],
+                    xy: [x, y],
+                    quadratic: [a, b, c],
+                    log2_opacity,
                     color: unroll!(c in 3 => colors[c][i]),
-                    depth: v[6],
-                    extent: [v[7], v[8]],
+                    depth,
+                    extent: [half_width, half_height],
                     hits: [self.part.len() as u32, 0],
                 };
                 let splat = (base + i) as u32;
@@ -176,7 +182,7 @@ impl ProjectPart<'_, '_> {
                     self.part.push(splat, tile, blocks);
                 });
                 footprint.hits[1] = self.part.len() as u32 - footprint.hits[0];
-                job.depth_keys[i] = v[6].to_bits();
+                job.depth_keys[i] = depth.to_bits();
                 job.footprints[i] = footprint;
             }
         }
@@ -355,7 +361,7 @@ impl ProjectChunkVjp<'_, '_> {
             let first = base + at;
             // Sum each visible splat's entries, in their order; [sum, lane]. Invisible lanes are masked below.
             let mut sums = [[0.0f32; 16]; SUMS];
-            let mut image = [[1.0f32; 16]; 7];
+            let mut shown = [[1.0f32; 16]; SHOWN_ROWS];
             let mut visible = [0.0f32; 16];
             for lane in 0..S::LANES {
                 if renderer.depth_keys[first + lane] == u32::MAX {
@@ -373,10 +379,8 @@ impl ProjectChunkVjp<'_, '_> {
                     to[lane] = total;
                 }
                 let [a, b, c] = s.quadratic;
-                for (to, value) in image
-                    .iter_mut()
-                    .zip([a, b, c, s.log2_opacity, s.color[0], s.color[1], s.color[2]])
-                {
+                let [red, green, blue] = s.color;
+                for (to, value) in shown.iter_mut().zip([a, b, c, s.log2_opacity, red, green, blue]) {
                     to[lane] = value;
                 }
             }
@@ -388,7 +392,7 @@ impl ProjectChunkVjp<'_, '_> {
                 continue;
             }
             let [s0, sx, sy, sxx, sxy, syy, red, green, blue, v_depth] = unroll!(i in 10 => simd.load(&sums[i]));
-            let [a, b, c, log2_opacity, shown_red, shown_green, shown_blue] = unroll!(i in 7 => simd.load(&image[i]));
+            let [a, b, c, log2_opacity, shown_red, shown_green, shown_blue] = unroll!(i in 7 => simd.load(&shown[i]));
             let moments = [s0, sx, sy, sxx, sxy, syy];
             let v_footprint = footprint_gradient([a, b, c], log2_opacity, moments, v_depth);
             let geometry = load_geometry(simd, self.splats, first);

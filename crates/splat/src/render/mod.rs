@@ -248,11 +248,6 @@ impl Renderer {
         self.visible.iter().map(|n| *n as usize).sum()
     }
 
-    /// Splat-tile pairs of the last frame.
-    pub fn tile_entries(&self) -> usize {
-        self.bins.entry_count()
-    }
-
     /// Width and height of the last frame, pixels.
     pub(crate) fn size(&self) -> Option<[u32; 2]> {
         self.view.as_ref().map(|view| [view.width, view.height])
@@ -399,18 +394,18 @@ impl Renderer {
                 })
             })
             .collect();
-        let of_part = jobs
+        let chunks_per_part = jobs
             .len()
             .div_ceil(PARTS_PER_THREAD * rayon::current_num_threads())
             .max(1);
-        let parts = jobs.len().div_ceil(of_part);
+        let parts = jobs.len().div_ceil(chunks_per_part);
         self.parts.resize_with(parts, Part::default);
         for (i, job) in jobs.iter().enumerate() {
-            self.part_of[job.chunk] = (i / of_part) as u32;
+            self.part_of[job.chunk] = (i / chunks_per_part) as u32;
         }
         self.bins.begin(view.width, view.height);
         let (level, filter, tiles) = (self.level, &self.filter, [self.bins.tiles_x, self.bins.tiles_y]);
-        jobs.par_chunks_mut(of_part)
+        jobs.par_chunks_mut(chunks_per_part)
             .zip(&mut self.parts)
             .for_each(|(jobs, part)| {
                 level.run(ProjectPart {

@@ -127,7 +127,7 @@ fn pattern(rng: &mut Rng, size: f32) -> Texture {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Capture, Part, SynthOptions};
+    use crate::{Capture, Split, SynthOptions};
 
     fn options(scene: SceneName, seed: u64) -> SynthOptions {
         SynthOptions {
@@ -174,7 +174,7 @@ mod tests {
                 let shots = capture
                     .shots()
                     .iter()
-                    .filter(move |shot| (shot.part == Part::Test) == held_out);
+                    .filter(move |shot| (shot.split == Split::Test) == held_out);
                 shots.map(|shot| shot.camera.pose).collect::<Vec<_>>()
             };
             for held_out in places(true) {

@@ -1,9 +1,10 @@
 //! The values carried by the clock, by parameter name, so that a new parameter leaves old checkpoints readable.
 
-use super::f64s;
+use super::damaged;
 use crate::recipe::{Param, Values};
+use crate::tensor_file::TensorSource;
 use crate::trainer::TrainError;
-use safetensors::tensor::{Dtype, SafeTensors};
+use safetensors::tensor::SafeTensors;
 
 /// Prefix of the names of their tensors; a parameter's name follows.
 const PREFIX: &str = "carried.";
@@ -60,15 +61,14 @@ pub(super) fn read(file: &SafeTensors, unnamed: &[f64]) -> Result<Values, TrainE
     let mut values = Values::default_values();
     if !unnamed.is_empty() {
         if unnamed.len() != FORMAT_4_PARAMS.len() {
-            return Err(TrainError::Checkpoint(
-                "the checkpoint is damaged: its clock has the wrong length".into(),
-            ));
+            return Err(damaged("its clock has the wrong length"));
         }
         for (param, value) in FORMAT_4_PARAMS.into_iter().zip(unnamed) {
             values[param] = *value;
         }
     }
-    for (name, view) in file.iter() {
+    let tensors = TensorSource::new(file, PREFIX);
+    for (name, _) in file.iter() {
         let Some(name) = name.strip_prefix(PREFIX) else {
             continue;
         };
@@ -78,12 +78,11 @@ pub(super) fn read(file: &SafeTensors, unnamed: &[f64]) -> Result<Values, TrainE
                  wrote it"
             ))
         })?;
-        let ([value], Dtype::F64) = (&f64s(view.data())[..], view.dtype()) else {
-            return Err(TrainError::Checkpoint(format!(
-                "the checkpoint is damaged: {PREFIX}{name} is not one number"
-            )));
+        let numbers = tensors.required_f64s(name).unwrap_or_default();
+        let [value] = numbers[..] else {
+            return Err(damaged(format!("{PREFIX}{name} is not one number")));
         };
-        values[param] = *value;
+        values[param] = value;
     }
     Ok(values)
 }

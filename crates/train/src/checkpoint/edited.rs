@@ -1,6 +1,10 @@
 //! Checkpoints of edited scenes: the optimiser's state follows the splats.
 
-use super::{COLUMN_NAMES, COLUMN_OWNERS, Content, Tensor, planes_of, recipe_of, write_tensors};
+use super::{
+    COLUMN_NAMES, COLUMN_OWNERS, Content, Tensor, damaged, has_consistent_columns, read_columns, read_planes,
+    recipe_of, write_tensors,
+};
+use crate::tensor_file::TensorSource;
 use crate::trainer::TrainError;
 use irradia_compute::Planes;
 use irradia_splat::Splats;
@@ -12,16 +16,12 @@ use safetensors::tensor::SafeTensors;
 /// When the bytes are not a checkpoint of this program.
 pub fn splats_of(bytes: &[u8]) -> Result<Splats, TrainError> {
     recipe_of(bytes)?;
-    let damaged = |why: String| TrainError::Checkpoint(format!("the checkpoint is damaged: {why}"));
-    let file = SafeTensors::deserialize(bytes).map_err(|e| damaged(e.to_string()))?;
-    let mut splats = Splats::default();
-    for (name, planes) in COLUMN_NAMES.iter().zip(splats.columns_mut()) {
-        *planes = planes_of(&file, &format!("{}.{name}", COLUMN_OWNERS[0])).map_err(damaged)?;
-    }
-    let shapes = |splats: &Splats| splats.columns().map(|column| (column.count(), column.len()));
-    match shapes(&splats) == shapes(&Splats::zeros(splats.len(), splats.sh_degree())) {
-        true => Ok(splats),
-        false => Err(damaged("its columns have different lengths".into())),
+    let file = SafeTensors::deserialize(bytes).map_err(damaged)?;
+    let splats = read_columns(TensorSource::new(&file, ""), COLUMN_OWNERS[0]).map_err(damaged)?;
+    if has_consistent_columns(&splats) {
+        Ok(splats)
+    } else {
+        Err(damaged("its columns have different lengths"))
     }
 }
 
@@ -37,9 +37,8 @@ pub fn with_splats(bytes: &[u8], splats: &Splats, sources: &[Option<u32>]) -> Re
     let before = splats_of(bytes)?;
     assert_eq!(splats.len(), sources.len(), "a source for every splat");
     assert_eq!(splats.sh.count(), before.sh.count(), "the bands of the checkpoint");
-    let damaged = |why: String| TrainError::Checkpoint(format!("the checkpoint is damaged: {why}"));
-    let file = SafeTensors::deserialize(bytes).map_err(|e| damaged(e.to_string()))?;
-    let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| damaged(e.to_string()))?;
+    let file = SafeTensors::deserialize(bytes).map_err(damaged)?;
+    let (_, header) = SafeTensors::read_metadata(bytes).map_err(damaged)?;
     let of_splats: Vec<String> = COLUMN_NAMES
         .iter()
         .map(|name| format!("{}.{name}", COLUMN_OWNERS[0]))
@@ -52,9 +51,9 @@ pub fn with_splats(bytes: &[u8], splats: &Splats, sources: &[Option<u32>]) -> Re
         .collect();
     let mut followed = Vec::new();
     for name in &followers {
-        let planes = planes_of(&file, name).map_err(damaged)?;
+        let planes = read_planes(TensorSource::new(&file, ""), name).map_err(damaged)?;
         if planes.len() != before.len() {
-            return Err(damaged("its columns have different lengths".into()));
+            return Err(damaged("its columns have different lengths"));
         }
         let mut moved = Planes::zeros(planes.count(), splats.len());
         for c in 0..planes.count() {

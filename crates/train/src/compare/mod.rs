@@ -274,7 +274,7 @@ fn all_figures(scenes: &[Scene]) -> impl Iterator<Item = (&str, &Figures)> {
 
 impl Spread {
     /// Spread of the finite values; `None` if there are none.
-    pub fn of(values: impl IntoIterator<Item = f64>) -> Option<Self> {
+    pub fn from_values(values: impl IntoIterator<Item = f64>) -> Option<Self> {
         let values: Vec<f64> = values.into_iter().filter(|v| v.is_finite()).collect();
         let n = values.len() as f64;
         if values.is_empty() {
@@ -340,18 +340,18 @@ impl Scene {
         let mark = runs.first().and_then(|(_, runs)| {
             let first = figures(runs);
             Some(Mark {
-                psnr: Spread::of(first.iter().map(|f| f.psnr))?.mean,
-                seconds: Spread::of(first.iter().map(|f| f.seconds))?.mean,
+                psnr: Spread::from_values(first.iter().map(|f| f.psnr))?.mean,
+                seconds: Spread::from_values(first.iter().map(|f| f.seconds))?.mean,
             })
         });
         let entries = runs
             .into_iter()
             .map(|(recipe, runs)| {
                 let figures = figures(&runs);
-                let spread = |of: &dyn Fn(&Figures) -> Option<f64>| Spread::of(figures.iter().filter_map(of));
+                let spread = |of: &dyn Fn(&Figures) -> Option<f64>| Spread::from_values(figures.iter().filter_map(of));
                 let times = |psnr: f64| {
                     let at = |axis: fn(&EvaluationPoint) -> f64| {
-                        Spread::of(
+                        Spread::from_values(
                             figures
                                 .iter()
                                 .filter_map(|f| position_at_psnr(&f.evaluations, psnr, axis)),

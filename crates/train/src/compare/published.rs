@@ -72,7 +72,7 @@ pub(super) fn lines(comparison: &Comparison) -> Option<Vec<Vec<String>>> {
         }
         for entry in &scene.entries {
             let figures = entry.runs.iter().filter_map(|run| run.figures.as_ref());
-            let vgg = Spread::of(figures.filter_map(|figures| figures.lpips_of("vgg")));
+            let vgg = Spread::from_values(figures.filter_map(|figures| figures.lpips_of("vgg")));
             let mean = |spread: Option<Spread>| spread.map(|spread| spread.mean);
             lines.push(vec![
                 scene.name.clone(),

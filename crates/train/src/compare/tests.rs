@@ -115,11 +115,11 @@ fn tables_name_the_network_of_lpips() {
 
 #[test]
 fn spreads_are_means_with_sample_deviations() {
-    assert_eq!(Spread::of([]), None);
-    assert_eq!(Spread::of([f64::NAN]), None);
-    let one = Spread::of([3.0, f64::INFINITY]).unwrap();
+    assert_eq!(Spread::from_values([]), None);
+    assert_eq!(Spread::from_values([f64::NAN]), None);
+    let one = Spread::from_values([3.0, f64::INFINITY]).unwrap();
     assert_eq!((one.mean, one.deviation, one.runs), (3.0, None, 1));
-    let three = Spread::of([1.0, 2.0, 3.0]).unwrap();
+    let three = Spread::from_values([1.0, 2.0, 3.0]).unwrap();
     assert_eq!((three.mean, three.deviation, three.runs), (2.0, Some(1.0), 3));
 }
 

@@ -14,31 +14,35 @@ use serde::{Deserialize, Serialize};
 #[serde(tag = "strategy", rename_all = "snake_case")]
 pub enum DensityControl {
     /// Clone, split, prune and reset, as in 3DGS; also AbsGS's variant of it.
-    Classic(ClassicKnobs),
+    Classic(ClassicSettings),
     /// Relocation and growth by opacity, as in 3DGS-MCMC.
-    Mcmc(McmcKnobs),
+    Mcmc(McmcSettings),
     /// Growth to an exact number by score, as in Taming 3DGS.
-    Taming(TamingKnobs),
+    Taming(TamingSettings),
     /// Splits by image error, to a planned number.
-    Fast(FastKnobs),
+    Fast(FastSettings),
 }
 
 impl DensityControl {
     /// Steps (of the run, not stretched) between rounds.
     pub fn every(&self) -> u64 {
         match self {
-            DensityControl::Classic(knobs) => knobs.every,
-            DensityControl::Mcmc(knobs) => knobs.every,
-            DensityControl::Taming(knobs) => knobs.every,
-            DensityControl::Fast(knobs) => knobs.every,
+            DensityControl::Classic(settings) => settings.every,
+            DensityControl::Mcmc(settings) => settings.every,
+            DensityControl::Taming(settings) => settings.every,
+            DensityControl::Fast(settings) => settings.every,
         }
     }
 
     /// Steps (of the run, not stretched) between resets of the opacities and the value to which they are reset.
     pub fn reset(&self) -> Option<(u64, f32)> {
         match self {
-            DensityControl::Classic(knobs) => (knobs.reset_every > 0).then_some((knobs.reset_every, knobs.reset_to)),
-            DensityControl::Taming(knobs) => (knobs.reset_every > 0).then_some((knobs.reset_every, knobs.reset_to)),
+            DensityControl::Classic(settings) => {
+                (settings.reset_every > 0).then_some((settings.reset_every, settings.reset_to))
+            }
+            DensityControl::Taming(settings) => {
+                (settings.reset_every > 0).then_some((settings.reset_every, settings.reset_to))
+            }
             DensityControl::Mcmc(_) | DensityControl::Fast(_) => None,
         }
     }
@@ -63,7 +67,7 @@ impl DensityControl {
     /// Weight of the photograph's edges in the gathered error.
     pub fn edge_share(&self) -> f32 {
         match self {
-            DensityControl::Taming(knobs) => knobs.edge_share,
+            DensityControl::Taming(settings) => settings.edge_share,
             DensityControl::Classic(_) | DensityControl::Mcmc(_) | DensityControl::Fast(_) => 0.0,
         }
     }
@@ -71,7 +75,7 @@ impl DensityControl {
     /// The statistics that it needs.
     pub fn statistics(&self) -> Statistics {
         match self {
-            DensityControl::Classic(knobs) if knobs.absolute => Statistics::AbsoluteGradient,
+            DensityControl::Classic(settings) if settings.absolute => Statistics::AbsoluteGradient,
             DensityControl::Classic(_) | DensityControl::Mcmc(_) => Statistics::Gradient,
             DensityControl::Taming(_) | DensityControl::Fast(_) => Statistics::Error,
         }
@@ -82,7 +86,7 @@ documented! {
     /// Parameters of [`irradia_splat::densify::classic`].
     #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
-    pub struct ClassicKnobs {
+    pub struct ClassicSettings {
         /// Steps (of the run, not stretched) between rounds, at least 1.
         pub every: u64,
         /// Mean screen gradient, normalised device coordinates, from which a splat is densified.
@@ -106,7 +110,7 @@ documented! {
     }
 }
 
-impl ClassicKnobs {
+impl ClassicSettings {
     /// Options with sizes in world units.
     pub fn options(&self, extent: f32, prune_large: bool, max_splats: usize) -> ClassicOptions {
         ClassicOptions {
@@ -124,7 +128,7 @@ documented! {
     /// Parameters of [`irradia_splat::densify::mcmc`].
     #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
-    pub struct McmcKnobs {
+    pub struct McmcSettings {
         /// Steps (of the run, not stretched) between rounds, at least 1.
         pub every: u64,
         /// Growth factor of the number of splats in `every` recipe steps.
@@ -134,7 +138,7 @@ documented! {
     }
 }
 
-impl McmcKnobs {
+impl McmcSettings {
     /// Options for a run with `pace` recipe steps per step.
     pub fn options(&self, pace: f64, max_splats: usize) -> McmcOptions {
         McmcOptions {
@@ -149,7 +153,7 @@ documented! {
     /// Parameters of [`irradia_splat::densify::taming`].
     #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
-    pub struct TamingKnobs {
+    pub struct TamingSettings {
         /// Steps (of the run, not stretched) between rounds, at least 1.
         pub every: u64,
         /// Mean screen gradient, normalised device coordinates, from which a splat may be densified.
@@ -183,7 +187,7 @@ documented! {
     }
 }
 
-impl TamingKnobs {
+impl TamingSettings {
     /// Options with sizes in world units, for round `round` of the stage, from 1.
     pub fn options(&self, extent: f32, prune_large: bool, round: u64, target: usize) -> TamingOptions {
         TamingOptions {
@@ -210,7 +214,7 @@ documented! {
     /// train fewer splats: it may use half the cap, and splits from four times the error.
     #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
-    pub struct FastKnobs {
+    pub struct FastSettings {
         /// Steps (of the run, not stretched) between rounds, at least 1.
         pub every: u64,
         /// Opacity below which a splat is removed.
@@ -227,7 +231,7 @@ documented! {
     }
 }
 
-impl FastKnobs {
+impl FastSettings {
     /// Options for at least `floor` and at most `target` splats after the round, in a run with `pace` recipe steps per step.
     pub fn options(&self, pace: f64, floor: usize, target: usize) -> FastOptions {
         FastOptions {
@@ -245,7 +249,7 @@ documented! {
     /// Parameters of merging in a stage ([`irradia_splat::densify::merge`]).
     #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
-    pub struct MergeKnobs {
+    pub struct MergeSettings {
         /// Steps (of the run, not stretched) between rounds, at least 1.
         pub every: u64,
         /// Maximum distance of splats to merge, in units of the smaller one's median axis.
@@ -255,7 +259,7 @@ documented! {
     }
 }
 
-impl MergeKnobs {
+impl MergeSettings {
     /// The strategy's options.
     pub fn options(&self) -> MergeOptions {
         MergeOptions {

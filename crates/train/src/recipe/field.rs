@@ -9,7 +9,7 @@ documented! {
     /// A radiance field, for the stages that train one.
     #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
-    pub struct FieldKnobs {
+    pub struct FieldSettings {
         /// The space of the field: `auto`, `bounded`, `unbounded` or `ndc`.
         #[serde(default)]
         pub space: FieldSpace,
@@ -41,7 +41,7 @@ documented! {
     /// A small field that adds a view-dependent colour to splats: reflections that harmonics cannot represent.
     #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
-    pub struct ResidualKnobs {
+    pub struct ResidualSettings {
         /// Decay of Adam's second moment.
         pub beta2: f32,
         /// Whether it is queried by the viewing direction reflected across the splat's shortest axis instead of the viewing direction
@@ -52,7 +52,7 @@ documented! {
     }
 }
 
-impl ResidualKnobs {
+impl ResidualSettings {
     /// `name` is that of the table, `images` the number of photographs with appearance codes, 0 for none.
     pub(super) fn validate(&self, name: &str, images: usize) -> Result<(), String> {
         if !(0.0..1.0).contains(&self.beta2) {
@@ -79,7 +79,7 @@ pub enum FieldSpace {
     Ndc,
 }
 
-impl FieldKnobs {
+impl FieldSettings {
     /// Configuration for `images` photographs in `space`: steps grow with distance only in unbounded space, and photographs with
     /// alpha (`transparent`) have no background to learn or to hide.
     pub fn config(&self, images: usize, space: &Space, transparent: bool) -> FieldConfig {
@@ -122,11 +122,11 @@ mod tests {
     #[test]
     fn a_field_is_initially_denser_if_photographs_are_opaque() {
         let recipe = Recipe::parse("hashgrid", Recipe::built_in("hashgrid").unwrap(), &[]).unwrap();
-        let knobs = recipe.field.unwrap();
+        let settings = recipe.field.unwrap();
         let space = Space::contracted([0.0; 3], 1.0);
-        let bias = |transparent| knobs.config(1, &space, transparent).net.density_bias;
-        assert_eq!(bias(true), knobs.net.density_bias);
-        assert_eq!(Some(bias(false)), knobs.opaque_density_bias);
+        let bias = |transparent| settings.config(1, &space, transparent).net.density_bias;
+        assert_eq!(bias(true), settings.net.density_bias);
+        assert_eq!(Some(bias(false)), settings.opaque_density_bias);
         assert!(bias(false) > bias(true));
     }
 }

@@ -3,8 +3,8 @@
 
 use super::edit_distance;
 use super::{
-    AdamKnobs, ClassicKnobs, Exit, FastKnobs, FieldKnobs, Group, Ingredients, InitKnobs, McmcKnobs, MergeKnobs, Param,
-    Recipe, RegularizerKnobs, RenderKnobs, ResidualKnobs, Stage, TamingKnobs,
+    AdamSettings, ClassicSettings, Exit, FastSettings, FieldSettings, Group, Ingredients, InitSettings, McmcSettings,
+    MergeSettings, Param, Recipe, RegularizerSettings, RenderSettings, ResidualSettings, Stage, TamingSettings,
 };
 use std::collections::BTreeSet;
 
@@ -168,19 +168,27 @@ pub fn keys() -> Vec<Key> {
     let density = "stage.STAGE.density";
     let tables: [(&str, &str, &[Documented]); 14] = [
         ("The recipe", "", Recipe::KEYS),
-        ("Rendering", "render", RenderKnobs::KEYS),
-        ("First splats", "init", InitKnobs::KEYS),
-        ("Adam", "adam", AdamKnobs::KEYS),
-        ("Regularisers", "regularizers", RegularizerKnobs::KEYS),
+        ("Rendering", "render", RenderSettings::KEYS),
+        ("First splats", "init", InitSettings::KEYS),
+        ("Adam", "adam", AdamSettings::KEYS),
+        ("Regularisers", "regularizers", RegularizerSettings::KEYS),
         ("Ingredients of a curriculum", "ingredients", Ingredients::KEYS),
         ("Stages", "stage.STAGE", Stage::KEYS),
-        ("Density control, `strategy = \"classic\"`", density, ClassicKnobs::KEYS),
-        ("Density control, `strategy = \"mcmc\"`", density, McmcKnobs::KEYS),
-        ("Density control, `strategy = \"taming\"`", density, TamingKnobs::KEYS),
-        ("Density control, `strategy = \"fast\"`", density, FastKnobs::KEYS),
-        ("Merging", "stage.STAGE.merge", MergeKnobs::KEYS),
-        ("Radiance field", "field", FieldKnobs::KEYS),
-        ("Residual field", "residual", ResidualKnobs::KEYS),
+        (
+            "Density control, `strategy = \"classic\"`",
+            density,
+            ClassicSettings::KEYS,
+        ),
+        ("Density control, `strategy = \"mcmc\"`", density, McmcSettings::KEYS),
+        (
+            "Density control, `strategy = \"taming\"`",
+            density,
+            TamingSettings::KEYS,
+        ),
+        ("Density control, `strategy = \"fast\"`", density, FastSettings::KEYS),
+        ("Merging", "stage.STAGE.merge", MergeSettings::KEYS),
+        ("Radiance field", "field", FieldSettings::KEYS),
+        ("Residual field", "residual", ResidualSettings::KEYS),
     ];
     let of_tables = tables
         .iter()

@@ -10,8 +10,8 @@ mod table;
 
 pub use ablation::Ingredients;
 pub use choice::Choice;
-pub use density::{ClassicKnobs, DensityControl, FastKnobs, McmcKnobs, MergeKnobs, TamingKnobs};
-pub use field::{FieldKnobs, FieldSpace, ResidualKnobs};
+pub use density::{ClassicSettings, DensityControl, FastSettings, McmcSettings, MergeSettings, TamingSettings};
+pub use field::{FieldSettings, FieldSpace, ResidualSettings};
 use irradia_splat::regularize::Regularized;
 use keys::documented;
 use param::check_knob;
@@ -111,20 +111,20 @@ documented! {
         /// Steps between checkpoints; at least 1.
         pub checkpoint_every: u64,
         /// How frames are rendered.
-        pub render: RenderKnobs,
+        pub render: RenderSettings,
         /// The first splats.
-        pub init: InitKnobs,
+        pub init: InitSettings,
         /// Adam's constants.
-        pub adam: AdamKnobs,
+        pub adam: AdamSettings,
         /// Options of the regularisers.
-        #[serde(default, skip_serializing_if = "RegularizerKnobs::is_default")]
-        pub regularizers: RegularizerKnobs,
+        #[serde(default, skip_serializing_if = "RegularizerSettings::is_default")]
+        pub regularizers: RegularizerSettings,
         /// The active ingredients of a curriculum.
         #[serde(default, skip_serializing_if = "Ingredients::all_active")]
         pub ingredients: Ingredients,
         /// The radiance field of the stages that train one.
         #[serde(default, skip_serializing_if = "Option::is_none")]
-        pub field: Option<FieldKnobs>,
+        pub field: Option<FieldSettings>,
         /// Train a separate exposure and white balance, an affine colour map, for each photograph; with `auto` if, after a tenth
         /// of the run, photographs differ in exposure beyond what adjacent cameras predict.
         #[serde(default, skip_serializing_if = "Choice::is_disabled")]
@@ -147,11 +147,11 @@ documented! {
         pub refine_poses: bool,
         /// A field that adds to the splats' colours.
         #[serde(default, skip_serializing_if = "Option::is_none")]
-        pub residual: Option<ResidualKnobs>,
+        pub residual: Option<ResidualSettings>,
         /// A field of position, with a code for each photograph, that adds to the splats' colours what the light of the photograph changes;
         /// active if `rate_codes` is above 0, and left out on a GPU.
         #[serde(default, skip_serializing_if = "Option::is_none")]
-        pub appearance: Option<ResidualKnobs>,
+        pub appearance: Option<ResidualSettings>,
         /// Parameters over the whole run; a stage may override them.
         pub params: Params,
         /// Parameters that replace those of `params` if the data show where space is empty: the dataset has points, or the photographs have
@@ -176,7 +176,7 @@ documented! {
     /// How frames are rendered.
     #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
-    pub struct RenderKnobs {
+    pub struct RenderSettings {
         /// Background colour, sRGB; images with alpha are composited over it.
         pub background: [f32; 3],
         /// Scale opacities by the area ratio of the 0.3 pixel dilation.
@@ -191,7 +191,7 @@ documented! {
     /// The first splats.
     #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
-    pub struct InitKnobs {
+    pub struct InitSettings {
         /// Opacity, between 0 and 1.
         pub opacity: f32,
         /// Opacity of splats at random positions, most of them in empty space; `init.opacity` when absent.
@@ -208,7 +208,7 @@ documented! {
     /// Adam's constants.
     #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
-    pub struct AdamKnobs {
+    pub struct AdamSettings {
         /// Decay of the first moment.
         pub beta1: f32,
         /// Decay of the second moment.
@@ -243,7 +243,7 @@ documented! {
     /// Options of the regularisers.
     #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
-    pub struct RegularizerKnobs {
+    pub struct RegularizerSettings {
         /// The splats over which they are averaged: `visible`, those visible in the frame, or `all`.
         #[serde(default)]
         pub of: RegularizedKind,
@@ -253,7 +253,7 @@ documented! {
     }
 }
 
-impl RegularizerKnobs {
+impl RegularizerSettings {
     fn is_default(&self) -> bool {
         *self == Self::default()
     }
@@ -310,7 +310,7 @@ documented! {
         pub density: Option<DensityControl>,
         /// How adjacent splats are merged; absent: they are not.
         #[serde(default)]
-        pub merge: Option<MergeKnobs>,
+        pub merge: Option<MergeSettings>,
         /// When the stage may end before its steps are completed; never if absent.
         #[serde(default)]
         pub exit: Option<Exit>,
@@ -469,7 +469,7 @@ impl Recipe {
     }
 
     /// The field for the light of photographs, if it is active.
-    pub(crate) fn light(&self) -> Option<&ResidualKnobs> {
+    pub(crate) fn light(&self) -> Option<&ResidualSettings> {
         self.appearance.as_ref().filter(|_| self.uses(Param::RateCodes))
     }
 
@@ -485,7 +485,7 @@ impl Recipe {
     }
 
     fn validate(&self) -> Result<(), String> {
-        let AdamKnobs {
+        let AdamSettings {
             beta1, beta2, epsilon, ..
         } = self.adam;
         for (name, beta) in [("beta1", beta1), ("beta2", beta2)] {
@@ -519,9 +519,9 @@ impl Recipe {
         if let Some(field) = &self.field {
             field.validate()?;
         }
-        for (name, knobs, images) in [("residual", &self.residual, 0), ("appearance", &self.appearance, 1)] {
-            if let Some(knobs) = knobs {
-                knobs.validate(name, images)?;
+        for (name, settings, images) in [("residual", &self.residual, 0), ("appearance", &self.appearance, 1)] {
+            if let Some(settings) = settings {
+                settings.validate(name, images)?;
             }
         }
         for (i, stage) in self.stage.iter().enumerate() {
@@ -540,8 +540,8 @@ impl Recipe {
                     stage.name
                 ));
             }
-            if let Some(DensityControl::Taming(knobs)) = &stage.density
-                && !(0.0..=1.0).contains(&knobs.edge_share)
+            if let Some(DensityControl::Taming(settings)) = &stage.density
+                && !(0.0..=1.0).contains(&settings.edge_share)
             {
                 return Err(format!(
                     "stage.{}.density.edge_share must be between 0 and 1",

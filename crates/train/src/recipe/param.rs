@@ -54,13 +54,13 @@ pub struct Values([f64; Param::ALL.len()]);
 
 impl Values {
     /// `value(param)` for each parameter.
-    pub fn of(value: impl FnMut(Param) -> f64) -> Self {
+    pub fn from_fn(value: impl FnMut(Param) -> f64) -> Self {
         Self(Param::ALL.map(value))
     }
 
     /// The defaults.
     pub fn default_values() -> Self {
-        Self::of(|param| param.row().default)
+        Self::from_fn(|param| param.row().default)
     }
 
     /// The value in effect: `photo_weight` is the weight of L1, what `ssim_weight` leaves, and `ssim_weight` that of 1 - SSIM; all

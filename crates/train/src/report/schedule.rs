@@ -30,7 +30,7 @@ pub struct KnobCurve {
 }
 
 /// Approximate number of samples of a run.
-const MAX_SAMPLES: f64 = 160.0;
+const TARGET_SAMPLES: f64 = 160.0;
 
 /// The schedule of a run of `recipe` at `clock` with the stages `stages`. `steps` is the number of steps into which it was
 /// fitted, `timed` whether it was fitted into a time budget instead.
@@ -51,9 +51,9 @@ pub fn schedule(recipe: &Recipe, stages: &[StageReport], clock: &Clock, steps: O
     };
     for (i, span) in spans.iter().enumerate() {
         let full = recipe.stage[i].steps as f64;
-        let parts = (MAX_SAMPLES * span.lasted / total.max(1.0))
+        let parts = (TARGET_SAMPLES * span.lasted / total.max(1.0))
             .ceil()
-            .clamp(1.0, MAX_SAMPLES) as usize;
+            .clamp(1.0, TARGET_SAMPLES) as usize;
         // Just before its end the stage is still current.
         let last = (span.lasted - 1e-3).max(0.0);
         let mut before = 0.0;

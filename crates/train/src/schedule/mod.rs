@@ -8,9 +8,9 @@ mod published;
 pub use convergence::ConvergenceMonitor;
 pub use outline::{OutlinePoint, UpcomingStretch, outline, upcoming};
 
-use crate::recipe::{DensityControl, Exit, Knob, MergeKnobs, Param, Recipe, Shape, Values};
+use crate::recipe::{DensityControl, Exit, Knob, MergeSettings, Param, Recipe, Shape, Values};
+use crate::stream::Stream;
 use convergence::MEASURE_EVERY;
-use irradia_scene::Rng;
 use irradia_splat::regularize::Regularizers;
 use irradia_splat::{Rates, Statistics};
 
@@ -68,7 +68,7 @@ pub struct StepPlan {
     /// A round of density control after the step.
     pub densify: Option<Round>,
     /// Merge adjacent splats after the step.
-    pub merge: Option<MergeKnobs>,
+    pub merge: Option<MergeSettings>,
     /// Reset opacities to this after the step.
     pub reset_opacity: Option<f32>,
     /// Recompute the smoothing filter before the step.
@@ -179,7 +179,8 @@ impl Clock {
         let in_stage = self.time - self.stage_time;
         self.monitor
             .observe(metrics.error, metrics.measured, metrics.views, in_stage);
-        if values(recipe, self)[Param::ImageScale] != before[Param::ImageScale] {
+        let growth = values(recipe, self)[Param::ImageScale] / before[Param::ImageScale];
+        if growth.max(1.0 / growth) > MAX_GROWTH {
             // Errors of images of different sizes cannot be compared: larger ones have more detail, and a larger error.
             self.monitor = ConvergenceMonitor::default();
         }
@@ -230,7 +231,7 @@ fn values(recipe: &Recipe, clock: &Clock) -> Values {
         return clock.carried;
     };
     let total = recipe.total_steps() as f64;
-    Values::of(|param| {
+    Values::from_fn(|param| {
         if let Some(knob) = stage.params.get(&param) {
             value(
                 knob,
@@ -313,14 +314,15 @@ pub fn plan(recipe: &Recipe, clock: &Clock) -> StepPlan {
     }
 }
 
+/// Growth of the images at a step up to which the error before and after it can be compared, so that gradual growth does not prevent the end
+/// of a stage.
+const MAX_GROWTH: f64 = 1.1;
+
 /// Steps between updates of the 3D smoothing filter (Mip-Splatting's code: 100).
 const REFILTER_EVERY: u64 = 100;
 
 /// Steps between updates of a field's occupancy grid (Instant-NGP).
 const OCCUPANCY_EVERY: u64 = 16;
-
-/// Random stream of the view order, derived from the run's seed.
-const STREAM_VIEWS: u64 = 3;
 
 /// The training views from this step on, each once: shuffled anew in each pass over them. A pure function of seed and step, so
 /// that a resumed run sees the same views.
@@ -328,7 +330,8 @@ pub fn upcoming_views(train: &[usize], seed: u64, clock: &Clock) -> Vec<usize> {
     let n = train.len() as u64;
     let pass = |number: u64| {
         let mut order = train.to_vec();
-        Rng::new(seed ^ number.wrapping_mul(0x9e37_79b9_7f4a_7c15), STREAM_VIEWS).shuffle(&mut order);
+        let seed = seed ^ number.wrapping_mul(0x9e37_79b9_7f4a_7c15);
+        Stream::ViewOrder.rng(seed).shuffle(&mut order);
         order
     };
     let (number, at) = (clock.step / n, (clock.step % n) as usize);

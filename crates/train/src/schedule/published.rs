@@ -244,7 +244,7 @@ fn taming_adds_along_the_published_parabola() {
 /// The rounds that prune: `iter_num < 27`, from 0.
 fn prune_rounds(recipe: &Recipe) -> Range<u64> {
     match recipe.stage[1].density {
-        Some(DensityControl::Taming(knobs)) => 1..knobs.prune_rounds + 1,
+        Some(DensityControl::Taming(settings)) => 1..settings.prune_rounds + 1,
         _ => 0..0,
     }
 }

@@ -3,15 +3,13 @@
 //! minus its output for the mean code: in the mean light, which held-out views and exported scenes have, it adds nothing.
 
 use super::color_field::{self, ColorField};
-use crate::recipe::{Param, ResidualKnobs};
+use crate::recipe::{Param, ResidualSettings};
 use crate::schedule::StepPlan;
+use crate::stream::Stream;
 use crate::trainer::TrainError;
 use glam::Vec3;
 use irradia_field::{Field, Space};
 use irradia_splat::Surface;
-
-/// Random stream, derived from the run's seed.
-const STREAM_APPEARANCE: u64 = 9;
 
 /// The colours that `field` adds to `surfaces` seen from `center`, world, in the light of `view`.
 pub(crate) fn lit_colors(field: &Field, view: usize, center: Vec3, surfaces: &[Surface]) -> Vec<[f32; 3]> {
@@ -28,12 +26,22 @@ fn terms(view: usize) -> [(Option<u32>, f32); 2] {
 }
 
 impl Appearance {
+    /// Name of the file beside the scene.
+    pub const FILE: &str = "appearance.safetensors";
+
     /// A field in `space`, with a code for each of `views`, that adds nothing yet.
     ///
     /// # Errors
     /// When the field's configuration is invalid.
-    pub fn new(knobs: &ResidualKnobs, views: usize, space: Space, seed: u64) -> Result<Self, TrainError> {
-        ColorField::new("appearance", knobs, views, space, seed ^ STREAM_APPEARANCE << 40).map(Self)
+    pub fn new(settings: &ResidualSettings, views: usize, space: Space, seed: u64) -> Result<Self, TrainError> {
+        ColorField::new(
+            "appearance",
+            settings,
+            views,
+            space,
+            Stream::Appearance.derived_seed(seed),
+        )
+        .map(Self)
     }
 
     /// Whether it adds to the frame of `plan`. Once it has begun it stays active.

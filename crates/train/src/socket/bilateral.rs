@@ -7,9 +7,11 @@
 //!
 //! `t` is a position in the grid, in cells from its first one; `w` is the weight of the cell after it, and 1 - w that of the cell before.
 
+use super::exposure::IDENTITY;
+use super::per_view::adam_step;
 use super::{Occupant, pixel_chunks};
 use crate::tensor_file::{NamedTensor, TensorSource, to_bytes};
-use irradia_compute::adam::{Active, AdamRates, AdamStep, adam};
+use irradia_compute::adam::{Active, AdamRates, adam};
 use irradia_compute::simd::{Kernel, Lanes, Simd};
 use irradia_compute::{Level, Planes};
 use rayon::prelude::*;
@@ -24,15 +26,11 @@ const CELLS: usize = GRID_SIZE[0] * GRID_SIZE[1] * GRID_SIZE[2];
 /// Cells of a row of the grid.
 const ROW_CELLS: usize = GRID_SIZE[1] * GRID_SIZE[2];
 /// Parameters of a cell: A row by row, then b.
-const N: usize = 12;
-const IDENTITY: [f32; N] = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0];
+const N: usize = IDENTITY.len();
 /// Weights of a colour's channels in its brightness (Rec. 601).
 const LUMA: [f32; 3] = [0.299, 0.587, 0.114];
 /// Rows of pixels whose gradients are summed together: a fixed number, so that the sum does not depend on threads.
 const ROWS_PER_TASK: usize = 8;
-/// Adam's constants as published (Kingma and Ba 2015).
-const BETAS: [f32; 2] = [0.9, 0.999];
-const EPSILON: f32 = 1e-15;
 
 /// A cell in the layout in which it is applied: the factors of red, green, blue and 1, each for three channels and a lane of padding.
 type Map = [f32; LANES];
@@ -79,6 +77,9 @@ impl ViewGrid {
 }
 
 impl BilateralGrid {
+    /// Name of the file beside the scene.
+    pub const FILE: &str = "bilateral.safetensors";
+
     /// For `views` views, of which `train` are the training views.
     pub fn new(views: usize, train: &[usize]) -> Self {
         Self {
@@ -102,7 +103,7 @@ impl BilateralGrid {
     }
 
     /// Applies the grid of `view` to `color` `[3, H, W]`, of `width` columns; results are at most 1.
-    pub fn develop(&self, view: usize, width: usize, color: &[f32], to: &mut Vec<f32>) {
+    pub fn apply(&self, view: usize, width: usize, color: &[f32], to: &mut Vec<f32>) {
         let grid = self.grid(view);
         to.resize(color.len(), 0.0);
         let (level, frame) = (Level::detect(), Frame::new(&grid, width, color));
@@ -110,7 +111,7 @@ impl BilateralGrid {
             .enumerate()
             .for_each(|(piece, to)| {
                 let first_row = piece * ROWS_PER_TASK;
-                level.run(DevelopRows {
+                level.run(ApplyRows {
                     frame: &frame,
                     first_row,
                     to,
@@ -118,7 +119,7 @@ impl BilateralGrid {
             });
     }
 
-    /// The vector-Jacobian product of [`Self::develop`]: `v` `[3, H, W]` becomes the gradient of `color`; returns that of the view's
+    /// The vector-Jacobian product of [`Self::apply`]: `v` `[3, H, W]` becomes the gradient of `color`; returns that of the view's
     /// grid, `[CELLS][N]`. Where the output is saturated, only gradients that darken it pass.
     pub fn vjp(&self, view: usize, width: usize, color: &[f32], v: &mut [f32]) -> Vec<f32> {
         vjp(&self.grid(view), width, color, v)
@@ -135,12 +136,7 @@ impl BilateralGrid {
         let view_grid = self.views[view].get_or_insert_with(ViewGrid::new);
         view_grid.steps += 1;
         let before = view_grid.own.clone();
-        let step = AdamStep {
-            beta1: BETAS[0],
-            beta2: BETAS[1],
-            epsilon: EPSILON,
-            step: view_grid.steps,
-        };
+        let step = adam_step(view_grid.steps);
         let [first, second] = &mut view_grid.moments;
         let gradient = Planes::from_interleaved(1, &gradient);
         let (own, moments) = (&mut view_grid.own, [first, second]);
@@ -225,7 +221,7 @@ impl Slice {
     #[inline(always)]
     fn apply(&self, maps: &[Map], x: [f32; 3]) -> [f32; 4] {
         let [dark, bright] = self.maps(maps);
-        apply(&mix(&dark, &bright, self.w_bright), x)
+        apply_map(&mix(&dark, &bright, self.w_bright), x)
     }
 
     /// The VJP of [`Self::apply`] and of saturation at 1: from the gradient `v` of their result, returns that of `x`, and adds that of the
@@ -234,7 +230,7 @@ impl Slice {
     fn vjp(&self, maps: &[Map], x: [f32; 3], v: [f32; 3], v_maps: &mut [Map]) -> [f32; 3] {
         let [dark, bright] = self.maps(maps);
         let map = mix(&dark, &bright, self.w_bright);
-        let (y, from_dark, from_bright) = (apply(&map, x), apply(&dark, x), apply(&bright, x));
+        let (y, from_dark, from_bright) = (apply_map(&map, x), apply_map(&dark, x), apply_map(&bright, x));
         let passes = |c: usize| if y[c] > 1.0 { v[c].max(0.0) } else { v[c] };
         let v = [passes(0), passes(1), passes(2), 0.0];
         let v_luma = self.slope * (0..3).map(|c| v[c] * (from_bright[c] - from_dark[c])).sum::<f32>();
@@ -268,7 +264,7 @@ fn mix(a: &Map, b: &Map, w: f32) -> Map {
 }
 
 #[inline(always)]
-fn apply(map: &Map, x: [f32; 3]) -> [f32; 4] {
+fn apply_map(map: &Map, x: [f32; 3]) -> [f32; 4] {
     let (terms, mut products) = ([x[0], x[1], x[2], 1.0], ZERO_MAP);
     for i in 0..LANES {
         products[i] = map[i] * terms[i / 4];
@@ -308,14 +304,14 @@ impl<'a> Frame<'a> {
     }
 }
 
-/// [`BilateralGrid::develop`] for a piece of rows that begins at `first_row`.
-struct DevelopRows<'a> {
+/// [`BilateralGrid::apply`] for a piece of rows that begins at `first_row`.
+struct ApplyRows<'a> {
     frame: &'a Frame<'a>,
     first_row: usize,
     to: [&'a mut [f32]; 3],
 }
 
-impl Kernel for DevelopRows<'_> {
+impl Kernel for ApplyRows<'_> {
     type Output = ();
 
     #[inline(always)]
@@ -540,7 +536,7 @@ mod tests {
 
     fn loss(grid: &BilateralGrid, color: &[f32], weights: &[f32]) -> f64 {
         let mut y = Vec::new();
-        grid.develop(1, WIDTH, color, &mut y);
+        grid.apply(1, WIDTH, color, &mut y);
         y.iter().zip(weights).map(|(y, w)| f64::from(*y) * f64::from(*w)).sum()
     }
 
@@ -549,7 +545,7 @@ mod tests {
         let (mut grid, color, _) = example();
         let unchanged = |grid: &BilateralGrid, view: usize| {
             let mut y = Vec::new();
-            grid.develop(view, WIDTH, &color, &mut y);
+            grid.apply(view, WIDTH, &color, &mut y);
             y.iter().zip(&color).all(|(y, x)| (y - x).abs() < 1e-6)
         };
         assert!(unchanged(&grid, 0) && !unchanged(&grid, 1) && unchanged(&grid, 2));
@@ -648,7 +644,7 @@ mod tests {
         let grid = BilateralGrid::new(1, &[0]);
         let color = [1.5, 1.5, 0.5];
         let mut y = Vec::new();
-        grid.develop(0, 1, &color, &mut y);
+        grid.apply(0, 1, &color, &mut y);
         assert_eq!(y, [1.0, 1.0, 0.5]);
         let mut v = [-1.0, 2.0, -1.0];
         grid.vjp(0, 1, &color, &mut v);
@@ -665,7 +661,7 @@ mod tests {
             let rate = if step < 200 { 0.02 } else { 0.002 };
             for view in [0, 2] {
                 let mut y = Vec::new();
-                grid.develop(view, WIDTH, &color, &mut y);
+                grid.apply(view, WIDTH, &color, &mut y);
                 let wanted = (0..3 * PIXELS).map(|i| gain(view, i % WIDTH) * color[i]);
                 let mut v: Vec<f32> = y.iter().zip(wanted).map(|(y, wanted)| y - wanted).collect();
                 grid.step(view, WIDTH, &color, &mut v, rate, 0.0);
@@ -684,7 +680,7 @@ mod tests {
         let (grid, color) = trained();
         let mut y = Vec::new();
         for view in [0, 2] {
-            grid.develop(view, WIDTH, &color, &mut y);
+            grid.apply(view, WIDTH, &color, &mut y);
             let off = |i: usize| (y[i] - gain(view, i % WIDTH) * color[i]).abs();
             let worst = (0..3 * PIXELS).map(off).fold(0.0, f32::max);
             assert!(worst < 0.02, "{view}: {worst}");

@@ -3,7 +3,7 @@
 
 use super::Occupant;
 use crate::field_file;
-use crate::recipe::{Param, ResidualKnobs};
+use crate::recipe::{Param, ResidualSettings};
 use crate::schedule::StepPlan;
 use crate::tensor_file::{NamedTensor, TensorSource};
 use crate::trainer::TrainError;
@@ -26,16 +26,16 @@ impl ColorField {
     /// A field in `space` with codes for `images` photographs, if its network takes codes, that adds nothing yet; `name` is the occupant's.
     pub fn new(
         name: &'static str,
-        knobs: &ResidualKnobs,
+        settings: &ResidualSettings,
         images: usize,
         space: Space,
         seed: u64,
     ) -> Result<Self, TrainError> {
-        let field = Field::residual(knobs.net, knobs.mirrored, images, space, seed)?;
+        let field = Field::residual(settings.net, settings.mirrored, images, space, seed)?;
         Ok(Self {
             name,
             state: FieldState::new(field),
-            beta2: knobs.beta2,
+            beta2: settings.beta2,
         })
     }
 
@@ -98,7 +98,7 @@ pub(super) fn added_colors(field: &Field, terms: Terms, center: Vec3, surfaces: 
 /// Queries of `field` for `surfaces` seen from `center`.
 fn queries(field: &Field, center: Vec3, surfaces: &[Surface]) -> Vec<ResidualQuery> {
     let mirrored = matches!(field.config.sampler, Sampler::Given { mirrored: true });
-    let sight = |surface: &Surface| {
+    let query = |surface: &Surface| {
         let view = (Vec3::from(surface.mean) - center).normalize_or_zero();
         let direction = if mirrored {
             let normal = Vec3::from(surface.normal);
@@ -111,5 +111,5 @@ fn queries(field: &Field, center: Vec3, surfaces: &[Surface]) -> Vec<ResidualQue
             direction: direction.to_array(),
         }
     };
-    surfaces.iter().map(sight).collect()
+    surfaces.iter().map(query).collect()
 }

@@ -12,7 +12,8 @@ use safetensors::SafeTensors;
 
 /// Parameters of a view: A row by row, then b.
 const N: usize = 12;
-const IDENTITY: [f32; N] = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0];
+/// The map that changes nothing.
+pub(super) const IDENTITY: [f32; N] = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0];
 /// Pixels whose gradients are summed together: a fixed number, so that the sum does not depend on threads.
 const PIXELS_PER_TASK: usize = 4096;
 
@@ -28,6 +29,9 @@ pub struct Exposure {
 }
 
 impl Exposure {
+    /// Name of the file beside the scene.
+    pub const FILE: &str = "exposure.safetensors";
+
     /// For `views` views, of which `train` are the training views.
     pub fn new(views: usize, train: &[usize]) -> Self {
         Self {
@@ -78,7 +82,7 @@ impl Exposure {
     }
 
     /// The map of `view`.
-    pub fn of(&self, view: usize) -> Affine {
+    pub fn map(&self, view: usize) -> Affine {
         let m = self.maps[view].map(f64::from);
         Affine {
             matrix: std::array::from_fn(|i| std::array::from_fn(|j| m[3 * i + j])),
@@ -87,7 +91,7 @@ impl Exposure {
     }
 
     /// Applies the map of `view` to `color` `[3, H, W]`; results are at most 1.
-    pub fn develop(&self, view: usize, color: &[f32], to: &mut Vec<f32>) {
+    pub fn apply(&self, view: usize, color: &[f32], to: &mut Vec<f32>) {
         let (m, pixels) = (&self.maps[view], color.len() / 3);
         to.resize(color.len(), 0.0);
         to.par_chunks_mut(pixels.max(1)).enumerate().for_each(|(c, plane)| {
@@ -99,7 +103,7 @@ impl Exposure {
         });
     }
 
-    /// The vector-Jacobian product of [`Self::develop`]: `v` `[3, H, W]` becomes the gradient of `color`; returns that of the
+    /// The vector-Jacobian product of [`Self::apply`]: `v` `[3, H, W]` becomes the gradient of `color`; returns that of the
     /// view's parameters. Where the output is saturated, only gradients that darken it pass.
     pub fn vjp(&self, view: usize, color: &[f32], v: &mut [f32]) -> [f32; N] {
         let (m, pixels) = (&self.maps[view], color.len() / 3);
@@ -194,7 +198,7 @@ mod tests {
 
     fn loss(exposure: &Exposure, color: &[f32], weights: &[f32]) -> f64 {
         let mut y = Vec::new();
-        exposure.develop(1, color, &mut y);
+        exposure.apply(1, color, &mut y);
         y.iter().zip(weights).map(|(y, w)| f64::from(*y) * f64::from(*w)).sum()
     }
 
@@ -202,14 +206,14 @@ mod tests {
     fn an_untrained_view_is_unchanged() {
         let (exposure, color, _) = example();
         let mut y = Vec::new();
-        exposure.develop(0, &color, &mut y);
+        exposure.apply(0, &color, &mut y);
         assert_eq!(y, color);
     }
 
     #[test]
     fn given_gains_are_relative_to_the_training_views() {
         let exposure = Exposure::new(4, &[0, 1, 3]).with_gains(&[(0, 0.3), (1, 0.3), (3, -0.3)]);
-        let gain = |view: usize| exposure.of(view).apply([0.5; 3])[1] / 0.5;
+        let gain = |view: usize| exposure.map(view).apply([0.5; 3])[1] / 0.5;
         assert!((gain(0) + gain(1) + gain(3) - 3.0).abs() < 1e-5);
         assert!((gain(0) - gain(3) - (0.2f32.exp() - (-0.4f32).exp())).abs() < 1e-5);
         assert_eq!(gain(2), 1.0);
@@ -251,7 +255,7 @@ mod tests {
         let exposure = Exposure::new(1, &[0]);
         let color = [1.5, 1.5, 0.5];
         let mut y = Vec::new();
-        exposure.develop(0, &color, &mut y);
+        exposure.apply(0, &color, &mut y);
         assert_eq!(y, [1.0, 1.0, 0.5]);
         let mut v = [-1.0, 2.0, -1.0];
         exposure.vjp(0, &color, &mut v);
@@ -268,13 +272,13 @@ mod tests {
             let rate = if step < 400 { 0.02 } else { 0.001 };
             for (view, gain) in [(0, 0.7), (2, 1.3)] {
                 let mut y = Vec::new();
-                exposure.develop(view, &color, &mut y);
+                exposure.apply(view, &color, &mut y);
                 let mut v: Vec<f32> = y.iter().zip(&color).map(|(y, x)| y - gain * x).collect();
                 exposure.step(view, &color, &mut v, rate, 0.0);
             }
         }
         for (view, gain) in [(0, 0.7), (1, 1.0), (2, 1.3)] {
-            let got = exposure.of(view).apply([0.5; 3]);
+            let got = exposure.map(view).apply([0.5; 3]);
             assert!(got.iter().all(|v| (v - gain * 0.5).abs() < 0.01), "{view}: {got:?}");
         }
     }

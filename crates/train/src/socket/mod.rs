@@ -41,15 +41,15 @@ use irradia_scene::{Camera, Dataset};
 use irradia_splat::{Engine, Placement, RenderOptions};
 use rayon::prelude::*;
 
-/// Names of the files that occupants may write beside a scene.
+/// Names of the files that occupants may write beside a scene, in the order of [`Sockets::occupants`].
 pub const FILES: [&str; 7] = [
-    "poses.safetensors",
-    "residual.safetensors",
-    "exposure.safetensors",
-    "sky.safetensors",
-    "appearance.safetensors",
-    "bilateral.safetensors",
-    "vignette.safetensors",
+    PoseRefinement::FILE,
+    Residual::FILE,
+    Appearance::FILE,
+    Exposure::FILE,
+    BilateralGrid::FILE,
+    Sky::FILE,
+    Vignette::FILE,
 ];
 
 /// The planes of `frame` `[3, H, W]` in pieces of `length` pixels, for all threads.
@@ -87,8 +87,8 @@ pub(crate) fn sum_of_colors(a: Option<Vec<[f32; 3]>>, b: Option<Vec<[f32; 3]>>) 
 
 /// The last of the `layers` that are present, else `frame`: the input of the next layer.
 fn topmost<'a>(frame: &'a [f32], layers: &[(bool, &'a Vec<f32>)]) -> &'a [f32] {
-    let there = layers.iter().rev().find(|(there, _)| *there);
-    there.map_or(frame, |(_, layer)| layer)
+    let last = layers.iter().rev().find(|(is_present, _)| *is_present);
+    last.map_or(frame, |(_, layer)| layer)
 }
 
 /// The part of a socket's occupant that is saved with a run.
@@ -131,9 +131,9 @@ pub struct Sockets {
     /// The frame after [`Vignette`], `[3, H, W]`.
     vignetted: Vec<f32>,
     /// The frame after [`Exposure`], `[3, H, W]`.
-    developed: Vec<f32>,
+    exposed: Vec<f32>,
     /// The frame after [`BilateralGrid`], `[3, H, W]`.
-    graded: Vec<f32>,
+    locally_exposed: Vec<f32>,
 }
 
 impl Sockets {
@@ -147,11 +147,11 @@ impl Sockets {
             Space::around(&cameras, !transparent).ok_or(TrainError::NoSpace)
         };
         let residual = match &recipe.residual {
-            Some(knobs) => Some(Residual::new(knobs, space()?, seed)?),
+            Some(settings) => Some(Residual::new(settings, space()?, seed)?),
             None => None,
         };
         let appearance = match recipe.light() {
-            Some(knobs) => Some(Appearance::new(knobs, dataset.views.len(), space()?, seed)?),
+            Some(settings) => Some(Appearance::new(settings, dataset.views.len(), space()?, seed)?),
             None => None,
         };
         Ok(Self {
@@ -166,8 +166,8 @@ impl Sockets {
             sky: recipe.uses(Param::RateSky).then(|| Sky::new(dataset)),
             over_sky: Vec::new(),
             vignetted: Vec::new(),
-            developed: Vec::new(),
-            graded: Vec::new(),
+            exposed: Vec::new(),
+            locally_exposed: Vec::new(),
         })
     }
 
@@ -264,16 +264,16 @@ impl Sockets {
             color = &self.over_sky;
         }
         if let Some(vignette) = &self.vignette {
-            vignette.develop(&camera.intrinsics, color, &mut self.vignetted);
+            vignette.apply(&camera.intrinsics, color, &mut self.vignetted);
             color = &self.vignetted;
         }
         if let Some(exposure) = &self.exposure {
-            exposure.develop(view, color, &mut self.developed);
-            color = &self.developed;
+            exposure.apply(view, color, &mut self.exposed);
+            color = &self.exposed;
         }
         if let Some(bilateral) = &self.bilateral {
             let width = camera.intrinsics.width as usize;
-            bilateral.develop(view, width, color, &mut self.graded);
+            bilateral.apply(view, width, color, &mut self.locally_exposed);
         }
     }
 
@@ -282,8 +282,8 @@ impl Sockets {
         let layers = [
             (self.sky.is_some(), &self.over_sky),
             (self.vignette.is_some(), &self.vignetted),
-            (self.exposure.is_some(), &self.developed),
-            (self.bilateral.is_some(), &self.graded),
+            (self.exposure.is_some(), &self.exposed),
+            (self.bilateral.is_some(), &self.locally_exposed),
         ];
         topmost(engine.frame().color, &layers)
     }
@@ -307,7 +307,7 @@ impl Sockets {
         let layers = [
             (self.sky.is_some(), &self.over_sky),
             (self.vignette.is_some(), &self.vignetted),
-            (self.exposure.is_some(), &self.developed),
+            (self.exposure.is_some(), &self.exposed),
         ];
         if let Some(bilateral) = &mut self.bilateral {
             let (rate, weight) = (plan.value(Param::RateBilateral), plan.value(Param::BilateralTv));

@@ -4,9 +4,21 @@ use crate::tensor_file::{NamedTensor, TensorSource};
 use irradia_compute::adam::{Active, AdamRates, AdamStep, adam};
 use irradia_compute::{Level, Planes};
 
-/// Adam's constants as published (Kingma and Ba 2015).
+/// Decays of the two moments, as published (Kingma and Ba 2015).
 const BETAS: [f32; 2] = [0.9, 0.999];
+/// Added to the root of the second moment: 1e-15 as in the code of 3DGS (Kerbl et al. 2023), not the 1e-8 of Kingma and Ba. The size of
+/// a step then does not depend on the scale of the gradients, however small they are.
 const EPSILON: f32 = 1e-15;
+
+/// Adam's constants for the parameters of a photograph in their step `step`, from 1.
+pub(super) fn adam_step(step: u64) -> AdamStep {
+    AdamStep {
+        beta1: BETAS[0],
+        beta2: BETAS[1],
+        epsilon: EPSILON,
+        step,
+    }
+}
 
 /// Moments and step counts of `N` parameters per view.
 #[derive(Clone, Debug, PartialEq)]
@@ -42,12 +54,6 @@ impl<const N: usize> PerViewAdam<N> {
         let [mut first, mut second] = [0, 1].map(|m: usize| self.moments[m].gather(&[view as u32]));
         let mut active = vec![0.0; one.stride()];
         active[0] = 1.0;
-        let step = AdamStep {
-            beta1: BETAS[0],
-            beta2: BETAS[1],
-            epsilon: EPSILON,
-            step: self.steps[view],
-        };
         adam(
             Level::detect(),
             &mut one,
@@ -55,7 +61,7 @@ impl<const N: usize> PerViewAdam<N> {
             [&mut first, &mut second],
             AdamRates::of_planes(&rates),
             Active::Sparse(&active, &[1]),
-            step,
+            adam_step(self.steps[view]),
         );
         for (moments, new) in self.moments.iter_mut().zip([&first, &second]) {
             for c in 0..N {

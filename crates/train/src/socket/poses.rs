@@ -28,6 +28,9 @@ pub struct PoseRefinement {
 }
 
 impl PoseRefinement {
+    /// Name of the file beside the scene.
+    pub const FILE: &str = "poses.safetensors";
+
     /// For the views of `dataset`.
     pub fn new(dataset: &Dataset) -> Self {
         let views = dataset.views.len();

@@ -1,15 +1,14 @@
 //! At colour: a small field that adds to the splats' colours, by position and viewing direction.
 
 use super::color_field::{self, ColorField, Terms};
-use crate::recipe::{Param, ResidualKnobs};
+use crate::recipe::{Param, ResidualSettings};
 use crate::schedule::StepPlan;
+use crate::stream::Stream;
 use crate::trainer::TrainError;
 use glam::Vec3;
 use irradia_field::{Field, Space};
 use irradia_splat::Surface;
 
-/// Random stream, derived from the run's seed.
-const STREAM_RESIDUAL: u64 = 8;
 /// The field's output, which is the same for all photographs.
 const TERMS: Terms = &[(None, 1.0)];
 
@@ -23,12 +22,15 @@ pub fn added_colors(field: &Field, center: Vec3, surfaces: &[Surface]) -> Vec<[f
 }
 
 impl Residual {
+    /// Name of the file beside the scene.
+    pub const FILE: &str = "residual.safetensors";
+
     /// A field in `space` that adds nothing yet.
     ///
     /// # Errors
     /// When the field's configuration is invalid.
-    pub fn new(knobs: &ResidualKnobs, space: Space, seed: u64) -> Result<Self, TrainError> {
-        ColorField::new("residual", knobs, 0, space, seed ^ STREAM_RESIDUAL << 40).map(Self)
+    pub fn new(settings: &ResidualSettings, space: Space, seed: u64) -> Result<Self, TrainError> {
+        ColorField::new("residual", settings, 0, space, Stream::Residual.derived_seed(seed)).map(Self)
     }
 
     /// Whether it adds to the frame of `plan`. Once it has begun it stays active.

@@ -73,6 +73,9 @@ fn directions(camera: &Camera, row: usize) -> impl Iterator<Item = Vec3> {
 }
 
 impl Sky {
+    /// Name of the file beside the scene.
+    pub const FILE: &str = "sky.safetensors";
+
     /// A grey sky for the views of `dataset`.
     pub fn new(dataset: &Dataset) -> Self {
         let axes = dataset
@@ -89,7 +92,8 @@ impl Sky {
         }
     }
 
-    fn of(&self, view: usize) -> [f32; N] {
+    /// The parameters of the sky of `view`.
+    fn parameters(&self, view: usize) -> [f32; N] {
         std::array::from_fn(|i| self.common[i] + self.own[view][i])
     }
 
@@ -100,12 +104,12 @@ impl Sky {
             let sum: f32 = self.train.iter().map(|view| self.own[*view][i]).sum();
             *mean += sum / self.train.len().max(1) as f32;
         }
-        color(&mean, self.axis).map(|v| v.clamp(0.0, 1.0))
+        color(&mean, self.axis).map(|channel| channel.clamp(0.0, 1.0))
     }
 
     /// Puts the sky of `view` behind `frame`: a colour `[3, H, W]` rendered over black, and its coverage `[H, W]`.
     pub fn composite_behind(&self, view: usize, camera: &Camera, frame: [&[f32]; 2], to: &mut Vec<f32>) {
-        let ([from, alpha], sky) = (frame, self.of(view));
+        let ([from, alpha], sky) = (frame, self.parameters(view));
         let (width, pixels) = (camera.intrinsics.width as usize, alpha.len());
         to.resize(from.len(), 0.0);
         pixel_chunks(to, width)
@@ -113,18 +117,18 @@ impl Sky {
             .for_each(|(row, [red, green, blue])| {
                 for (x, direction) in directions(camera, row).enumerate() {
                     let at = row * width + x;
-                    let (behind, left) = (color(&sky, direction), 1.0 - alpha[at]);
-                    red[x] = from[at] + left * behind[0];
-                    green[x] = from[pixels + at] + left * behind[1];
-                    blue[x] = from[2 * pixels + at] + left * behind[2];
+                    let (behind, uncovered) = (color(&sky, direction), 1.0 - alpha[at]);
+                    red[x] = from[at] + uncovered * behind[0];
+                    green[x] = from[pixels + at] + uncovered * behind[1];
+                    blue[x] = from[2 * pixels + at] + uncovered * behind[2];
                 }
             });
     }
 
     /// The vector-Jacobian product of [`Self::composite_behind`]: adds the gradient of `alpha` to `v_alpha`, and returns that of the view's
-    /// colours; that of `color` is `v` itself.
-    pub fn vjp(&self, view: usize, camera: &Camera, alpha: &[f32], v: &[f32], v_alpha: &mut [f32]) -> [f32; N] {
-        let (sky, pixels) = (self.of(view), alpha.len());
+    /// colours; that of `color` is `v_color` itself.
+    pub fn vjp(&self, view: usize, camera: &Camera, alpha: &[f32], v_color: &[f32], v_alpha: &mut [f32]) -> [f32; N] {
+        let (sky, pixels) = (self.parameters(view), alpha.len());
         let width = camera.intrinsics.width as usize;
         let rows: Vec<[f64; N]> = v_alpha
             .par_chunks_mut(width)
@@ -133,13 +137,13 @@ impl Sky {
                 let mut sum = [0.0f64; N];
                 for (x, direction) in directions(camera, row).enumerate() {
                     let at = row * width + x;
-                    let (behind, left) = (color(&sky, direction), 1.0 - alpha[at]);
+                    let (behind, uncovered) = (color(&sky, direction), 1.0 - alpha[at]);
                     let terms = terms(direction);
                     for c in 0..3 {
-                        let v = v[c * pixels + at];
-                        v_alpha[x] -= v * behind[c];
+                        let v_channel = v_color[c * pixels + at];
+                        v_alpha[x] -= v_channel * behind[c];
                         for k in 0..TERMS {
-                            sum[TERMS * c + k] += f64::from(v * left * terms[k]);
+                            sum[TERMS * c + k] += f64::from(v_channel * uncovered * terms[k]);
                         }
                     }
                 }
@@ -151,11 +155,19 @@ impl Sky {
     }
 
     /// [`Self::vjp`] and a step of Adam at `rate`.
-    pub fn step(&mut self, view: usize, camera: &Camera, alpha: &[f32], v: &[f32], v_alpha: &mut [f32], rate: f32) {
-        let gradient = self.vjp(view, camera, alpha, v, v_alpha);
+    pub fn step(
+        &mut self,
+        view: usize,
+        camera: &Camera,
+        alpha: &[f32],
+        v_color: &[f32],
+        v_alpha: &mut [f32],
+        rate: f32,
+    ) {
+        let gradient = self.vjp(view, camera, alpha, v_color, v_alpha);
         let common = self.common_adam.step(0, gradient, [rate; N]);
-        let of_own = std::array::from_fn(|i| gradient[i] + 2.0 * OWN_WEIGHT * self.own[view][i]);
-        let own = self.own_adam.step(view, of_own, [rate; N]);
+        let own_gradient = std::array::from_fn(|i| gradient[i] + 2.0 * OWN_WEIGHT * self.own[view][i]);
+        let own = self.own_adam.step(view, own_gradient, [rate; N]);
         for i in 0..N {
             self.common[i] += common[i];
             self.own[view][i] += own[i];
@@ -348,7 +360,7 @@ mod tests {
             }
         }
         for (view, wanted) in wanted.iter().enumerate() {
-            let got = super::color(&sky.of(view), directions(&camera(), 3).nth(4).unwrap());
+            let got = super::color(&sky.parameters(view), directions(&camera(), 3).nth(4).unwrap());
             assert!(
                 got.iter().zip(wanted).all(|(got, wanted)| (got - wanted).abs() < 0.02),
                 "{view}: {got:?}"
@@ -361,9 +373,9 @@ mod tests {
     fn the_exported_background_is_the_mean_over_the_training_views() {
         let (sky, ..) = example();
         let background = background_of_sky(&sky.export().unwrap()).unwrap();
-        let of = |view: usize| super::color(&sky.of(view), sky.axis);
+        let background_of = |view: usize| super::color(&sky.parameters(view), sky.axis);
         for c in 0..3 {
-            assert!((background[c] - 0.5 * (of(0)[c] + of(1)[c])).abs() < 1e-6);
+            assert!((background[c] - 0.5 * (background_of(0)[c] + background_of(1)[c])).abs() < 1e-6);
         }
         assert!(background_of_sky(b"{}").is_err());
         let without = to_bytes(

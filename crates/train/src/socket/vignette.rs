@@ -31,7 +31,7 @@ struct Lens {
 }
 
 impl Lens {
-    fn of(k: &Intrinsics) -> Self {
+    fn from_intrinsics(k: &Intrinsics) -> Self {
         let (short, long) = (k.width.min(k.height) as f32, k.width.max(k.height) as f32);
         Self {
             proportion: short / long,
@@ -60,11 +60,14 @@ pub struct Vignette {
 }
 
 impl Vignette {
+    /// Name of the file beside the scene.
+    pub const FILE: &str = "vignette.safetensors";
+
     /// For the lenses of the training photographs; `None` if all of these are faces of cubes.
     pub fn new(dataset: &Dataset) -> Option<Self> {
         let mut lenses: Vec<Lens> = Vec::new();
         for view in &dataset.train {
-            let lens = Lens::of(&dataset.views[*view].camera.intrinsics);
+            let lens = Lens::from_intrinsics(&dataset.views[*view].camera.intrinsics);
             if !lens.is_cube_face() && !lenses.iter().any(|other| other.matches(lens)) {
                 lenses.push(lens);
             }
@@ -117,12 +120,12 @@ impl Vignette {
     }
 
     fn lens_of(&self, k: &Intrinsics) -> Option<usize> {
-        let lens = Lens::of(k);
+        let lens = Lens::from_intrinsics(k);
         self.lenses.iter().position(|other| other.matches(lens))
     }
 
     /// `color` `[3, H, W]` as the lens of `k` shows it, at most 1; unchanged if the lens is unknown.
-    pub fn develop(&self, k: &Intrinsics, color: &[f32], to: &mut Vec<f32>) {
+    pub fn apply(&self, k: &Intrinsics, color: &[f32], to: &mut Vec<f32>) {
         to.clear();
         to.extend_from_slice(color);
         let Some(lens) = self.lens_of(k) else {
@@ -142,7 +145,7 @@ impl Vignette {
             });
     }
 
-    /// `image` `[H, W, 3]` as the lens of `k` shows it, as [`Self::develop`] does with planes.
+    /// `image` `[H, W, 3]` as the lens of `k` shows it, as [`Self::apply`] does with planes.
     pub fn apply_to(&self, k: &Intrinsics, mut image: Image) -> Image {
         if let Some(lens) = self.lens_of(k) {
             let curve = self.curves[lens];
@@ -155,7 +158,7 @@ impl Vignette {
         image
     }
 
-    /// The vector-Jacobian product of [`Self::develop`]: `v` `[3, H, W]` becomes the gradient of `color`; returns that of the curve.
+    /// The vector-Jacobian product of [`Self::apply`]: `v` `[3, H, W]` becomes the gradient of `color`; returns that of the curve.
     /// Where the output is saturated, only gradients that darken it pass.
     fn vjp(&self, lens: usize, k: &Intrinsics, color: &[f32], v: &mut [f32]) -> [f32; N] {
         let (curve, width) = (self.curves[lens], k.width as usize);
@@ -189,7 +192,7 @@ impl Vignette {
         sum_of(&sums)
     }
 
-    /// The vector-Jacobian product of [`Self::develop`], and a step of Adam at `rate`.
+    /// The vector-Jacobian product of [`Self::apply`], and a step of Adam at `rate`.
     pub fn step(&mut self, k: &Intrinsics, color: &[f32], v: &mut [f32], rate: f32) {
         let Some(lens) = self.lens_of(k) else {
             return;
@@ -287,7 +290,7 @@ mod tests {
 
     fn loss(vignette: &Vignette, k: &Intrinsics, color: &[f32], weights: &[f32]) -> f64 {
         let mut y = Vec::new();
-        vignette.develop(k, color, &mut y);
+        vignette.apply(k, color, &mut y);
         y.iter().zip(weights).map(|(y, w)| f64::from(*y) * f64::from(*w)).sum()
     }
 
@@ -299,7 +302,7 @@ mod tests {
         (k.fx, k.fy) = (9.0, 9.0);
         vignette.curves[0] = [-0.1, -0.1, -0.1];
         let mut y = Vec::new();
-        vignette.develop(&k, &[0.5; 135], &mut y);
+        vignette.apply(&k, &[0.5; 135], &mut y);
         let image = vignette.apply_to(&k, Image::new(9, 5, 3, vec![0.5; 135]));
         assert!((0..45).all(|i| image.data[3 * i..][..3] == [y[i], y[45 + i], y[90 + i]]));
         assert_eq!(y[2 * 9 + 4], 0.5);
@@ -307,7 +310,7 @@ mod tests {
         let expected = 0.5 * (1.0 - 0.1 * (u + u * u + u * u * u));
         assert!((y[0] - expected).abs() < 1e-6 && (y[134] - expected).abs() < 1e-6);
         assert!((vignette.corner_gain().unwrap() - 0.7).abs() < 1e-6);
-        vignette.develop(&k.resized(9, 9), &[0.5; 243], &mut y);
+        vignette.apply(&k.resized(9, 9), &[0.5; 243], &mut y);
         assert_eq!(y, [0.5; 243], "another lens");
     }
 
@@ -349,7 +352,7 @@ mod tests {
         let mut k = Intrinsics::from_fov_x(4, 4, 1.0);
         (k.fx, k.fy) = (4.0, 4.0);
         let mut y = Vec::new();
-        vignette.develop(&k, &[0.9; 48], &mut y);
+        vignette.apply(&k, &[0.9; 48], &mut y);
         assert_eq!(y[0], 1.0);
         let mut v = [-1.0; 48];
         assert!(vignette.vjp(0, &k, &[0.9; 48], &mut v)[0] > -0.5 * 48.0);
@@ -361,13 +364,13 @@ mod tests {
         let (truth, k, color, _) = example();
         let mut found = Vignette::untrained(truth.lenses.clone());
         let (mut wanted, mut y) = (Vec::new(), Vec::new());
-        truth.develop(&k, &color, &mut wanted);
+        truth.apply(&k, &color, &mut wanted);
         for step in 0..6000 {
-            found.develop(&k, &color, &mut y);
+            found.apply(&k, &color, &mut y);
             let mut v: Vec<f32> = y.iter().zip(&wanted).map(|(y, w)| y - w).collect();
             found.step(&k, &color, &mut v, 0.01 * 0.1f32.powf(step as f32 / 6000.0));
         }
-        found.develop(&k, &color, &mut y);
+        found.apply(&k, &color, &mut y);
         let worst = y.iter().zip(&wanted).map(|(y, w)| (y - w).abs()).fold(0.0, f32::max);
         assert!(worst < 0.003, "{worst} {:?}", found.curves);
     }

@@ -36,9 +36,10 @@ impl Saved {
 
 /// A scene's file, or its folder of images.
 fn scene_entry(source: &Path) -> &Path {
-    match source.file_name().is_some_and(|name| name == "meta.json") {
-        true => source.parent().unwrap_or(source),
-        false => source,
+    if source.file_name().is_some_and(|name| name == "meta.json") {
+        source.parent().unwrap_or(source)
+    } else {
+        source
     }
 }
 

@@ -19,7 +19,7 @@ const MAX_SELECTION_NUMBERS: usize = 8_000_000;
 
 /// The action of an entry.
 #[derive(Clone, Debug)]
-enum Action {
+enum EntryAction {
     Select {
         steps: Vec<SelectStep>,
         replace: bool,
@@ -34,7 +34,7 @@ struct Entry {
     /// Entries of the same gesture replace each other.
     gesture: u64,
     text: String,
-    action: Action,
+    action: EntryAction,
 }
 
 /// A state after a number of edits.
@@ -109,7 +109,7 @@ impl Session {
     /// All entries, including those undone.
     pub fn entries(&self) -> impl ExactSizeIterator<Item = EntryView<'_>> {
         self.entries.iter().map(|entry| EntryView {
-            is_edit: matches!(entry.action, Action::Edit(..)),
+            is_edit: matches!(entry.action, EntryAction::Edit(..)),
             text: &entry.text,
         })
     }
@@ -125,7 +125,7 @@ impl Session {
         self.entries[..self.position]
             .iter()
             .filter_map(|entry| match &entry.action {
-                Action::Edit(edit, _) => Some(edit),
+                EntryAction::Edit(edit, _) => Some(edit),
                 _ => None,
             })
     }
@@ -143,7 +143,7 @@ impl Session {
         let moved = self.entries[..self.position]
             .iter()
             .filter_map(|entry| match &entry.action {
-                Action::Edit(_, moved) => moved.as_ref(),
+                EntryAction::Edit(_, moved) => moved.as_ref(),
                 _ => None,
             });
         moved.fold(Transform::IDENTITY, |all, next| all.then(next))
@@ -174,7 +174,7 @@ impl Session {
             let all = [&before[..], &steps].concat();
             let selected = session.evaluate(&all, before.len())?;
             let text = select_text(&steps, replace);
-            session.push(gesture, text, Action::Select { steps, replace });
+            session.push(gesture, text, EntryAction::Select { steps, replace });
             (session.steps, session.selected) = (all, Arc::new(selected));
             Ok(())
         })
@@ -231,7 +231,7 @@ impl Session {
         if self.steps.is_empty() {
             return;
         }
-        self.push(0, "Deselect".to_owned(), Action::Deselect);
+        self.push(0, "Deselect".to_owned(), EntryAction::Deselect);
         (self.steps, self.selected) = (Vec::new(), Arc::new(Selection::none(self.draft.len())));
     }
 
@@ -284,13 +284,14 @@ impl Session {
         let mut draft = (*self.draft).clone();
         let open = |file: &str| self.uploads.open(file);
         // What is selected need not be searched for again, which may take a minute.
-        let applied = match edit.select.as_ref() == Some(&self.steps) {
-            true => apply_to(&mut draft, &edit, &self.selected, &open)?,
-            false => apply(&mut draft, &edit, &open)?,
+        let applied = if edit.select.as_ref() == Some(&self.steps) {
+            apply_to(&mut draft, &edit, &self.selected, &open)?
+        } else {
+            apply(&mut draft, &edit, &open)?
         };
         self.before = Some((self.draft.clone(), self.steps.clone(), self.selected.clone()));
         let text = edit_text(&applied.edit.op, applied.selected, self.draft.len(), draft.len());
-        self.push(gesture, text, Action::Edit(applied.edit, applied.moved));
+        self.push(gesture, text, EntryAction::Edit(applied.edit, applied.moved));
         self.set_draft(Arc::new(draft));
         self.steps = self.steps_at(self.position);
         self.selected = Arc::new(select(&self.draft, &self.steps)?);
@@ -303,9 +304,9 @@ impl Session {
             .entries
             .iter()
             .map(|entry| match &entry.action {
-                Action::Select { steps, .. } => points(steps),
-                Action::Edit(edit, _) => points(edit.select.as_deref().unwrap_or_default()),
-                Action::Deselect => 0,
+                EntryAction::Select { steps, .. } => points(steps),
+                EntryAction::Edit(edit, _) => points(edit.select.as_deref().unwrap_or_default()),
+                EntryAction::Deselect => 0,
             })
             .sum();
         if self.entries.len() >= MAX_ENTRIES || all + points(steps) > MAX_SELECTION_NUMBERS {
@@ -333,7 +334,7 @@ impl Session {
         outcome
     }
 
-    fn push(&mut self, gesture: u64, text: String, action: Action) {
+    fn push(&mut self, gesture: u64, text: String, action: EntryAction) {
         let edits = self.edits().count();
         self.snapshots.retain(|snapshot| snapshot.edits <= edits);
         self.entries.truncate(self.position);
@@ -366,14 +367,14 @@ impl Session {
         let mut steps = Vec::new();
         for entry in &self.entries[..at] {
             match &entry.action {
-                Action::Select { steps: more, replace } => {
+                EntryAction::Select { steps: more, replace } => {
                     if *replace {
                         steps.clear();
                     }
                     steps.extend_from_slice(more);
                 }
-                Action::Deselect => steps.clear(),
-                Action::Edit(edit, _) => {
+                EntryAction::Deselect => steps.clear(),
+                EntryAction::Edit(edit, _) => {
                     steps.clear();
                     let is_whole = edit.select.is_none();
                     if keeps_selection(&edit.op) && is_whole == matches!(edit.op, Operation::Merge { .. }) {

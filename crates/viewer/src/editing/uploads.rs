@@ -125,9 +125,10 @@ fn refused(message: String) -> EditingError {
 
 /// `c`, or an underscore for a character that some systems refuse in file names or that could form a path.
 fn sanitized(c: char) -> char {
-    match c.is_alphanumeric() || "-_.".contains(c) {
-        true => c,
-        false => '_',
+    if c.is_alphanumeric() || "-_.".contains(c) {
+        c
+    } else {
+        '_'
     }
 }
 

@@ -25,7 +25,7 @@ struct Workspace {
     saved: Option<Saved>,
     unsaved: UnsavedEdits,
     /// Whether the last attempt to keep the unsaved edits has failed, which pages are told once.
-    has_save_failed: bool,
+    save_failed: bool,
     /// What was shown last: splats, selection and its number, which is 0 if nothing is selected.
     shown: Option<(Arc<Draft>, Option<Arc<Selection>>)>,
     mask: u64,
@@ -66,7 +66,7 @@ pub(crate) fn run_editing(
         if let Some(workspace) = &mut workspace {
             workspace.show(subject);
             editing.set_current(workspace.session.draft(), workspace.session.list());
-            let failed_before = workspace.has_save_failed;
+            let failed_before = workspace.save_failed;
             if let Err(error) = workspace.write_unsaved(editing)
                 && !failed_before
             {
@@ -104,7 +104,7 @@ impl Workspace {
             before: false,
             saved: None,
             unsaved: UnsavedEdits::default(),
-            has_save_failed: false,
+            save_failed: false,
             // What is drawn was read from the same file.
             shown: (drawn == Some(session.draft().len())).then(|| (session.original().clone(), None)),
             session,
@@ -147,16 +147,17 @@ impl Workspace {
     /// Writes the unsaved edits beside the scene.
     fn write_unsaved(&mut self, editing: &Editing) -> Result<(), EditingError> {
         let kept = self.unsaved.update(&self.session, &editing.source, self.saved.as_ref());
-        self.has_save_failed = kept.is_err();
+        self.save_failed = kept.is_err();
         kept
     }
 
     /// Shows the current state of the session.
     fn show(&mut self, subject: &Subject) {
         let session = &self.session;
-        let (draft, selected, placement) = match self.before {
-            true => (session.original(), None, Transform::IDENTITY),
-            false => (session.draft(), Some(session.selected()), session.placement()),
+        let (draft, selected, placement) = if self.before {
+            (session.original(), None, Transform::IDENTITY)
+        } else {
+            (session.draft(), Some(session.selected()), session.placement())
         };
         let selected = selected.filter(|selected| !selected.is_empty()).cloned();
         let is_same = |a: &Option<Arc<Selection>>, b: &Option<Arc<Selection>>| match (a, b) {
@@ -165,8 +166,8 @@ impl Workspace {
         };
         let known = self.shown.as_ref();
         let is_new = known.is_none_or(|(known, _)| !Arc::ptr_eq(known, draft));
-        let is_masked = known.is_none_or(|(_, known)| !is_same(known, &selected));
-        if is_new || is_masked {
+        let selection_changed = known.is_none_or(|(_, known)| !is_same(known, &selected));
+        if is_new || selection_changed {
             let shown = |selected: &Arc<Selection>| {
                 let all = selected.as_slice().iter().zip(draft.hidden.as_slice());
                 Arc::new(

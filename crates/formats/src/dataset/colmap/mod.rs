@@ -180,9 +180,10 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
         cameras.insert(camera.id, declared);
     }
     let images = files.images()?;
-    let (points, index_of) = match files.path("points3D").is_file() {
-        true => point_cloud(files.read("points3D", binary::parse_points, text::parse_points)?),
-        false => Default::default(),
+    let (points, index_of) = if files.path("points3D").is_file() {
+        point_cloud(files.read("points3D", binary::parse_points, text::parse_points)?)
+    } else {
+        Default::default()
     };
 
     let folder = choose_image_folder(root, downscale).unwrap_or(ImageFolder {

@@ -391,12 +391,13 @@ impl<'a> Palette<'a> {
         labels: &'a Pixels,
         count: usize,
     ) -> Result<Option<Self>, Malformed> {
-        let degree = match is_version_2 {
-            true => harmonics.bands,
+        let degree = if is_version_2 {
+            harmonics.bands
+        } else {
             // Version 1 gives it by the width of the image.
-            false => (1..=3)
+            (1..=3)
                 .find(|degree| ENTRIES_PER_ROW * (sh::coefficients(*degree) - 1) == image.width)
-                .unwrap_or(9),
+                .unwrap_or(9)
         };
         if degree == 0 {
             return Ok(None);

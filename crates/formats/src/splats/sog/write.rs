@@ -109,15 +109,12 @@ pub(crate) fn encode(cloud: &GaussianCloud, options: &WriteOptions) -> io::Resul
             .collect();
         let palette = Palette::of(&vectors, rest, detail.palette.clamp(2, 65_536));
         let codebook = Codebook::of(&palette.entries, 256);
-        let codebook = match palette
+        let has_zero = palette
             .entries
             .chunks_exact(rest)
-            .any(|entry| entry.iter().all(|v| *v == 0.0))
-        {
-            // Harmonics of zero stay zero.
-            true => codebook.with_zero(),
-            false => codebook,
-        };
+            .any(|entry| entry.iter().all(|v| *v == 0.0));
+        // Harmonics of zero stay zero.
+        let codebook = if has_zero { codebook.with_zero() } else { codebook };
         let entries = palette.entries.len() / rest;
         let mut pixels: Vec<u8> = palette.entries.iter().map(|v| codebook.index(*v)).collect();
         let rows = entries.div_ceil(ENTRIES_PER_ROW);

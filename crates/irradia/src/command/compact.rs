@@ -2,7 +2,7 @@
 
 use super::convert::QualityArg;
 use super::share::parse_size;
-use super::{DataArgs, note_lines, size_line, thread_count, use_threads, with_option_names};
+use super::{DataArgs, data_for, note_lines, size_line, thread_count, use_threads, with_option_names};
 use crate::terminal::{note, print_line};
 use anyhow::Result;
 use irradia_runs::formats::WriteOptions;
@@ -14,9 +14,9 @@ use std::path::PathBuf;
 pub struct Args {
     /// The scene: a run, or a splat file of any format
     pub scene: PathBuf,
-    /// Dataset of photographs on which it was trained
+    /// Dataset of photographs on which it was trained; when absent that of the run that contains the scene
     #[arg(long)]
-    pub data: PathBuf,
+    pub data: Option<PathBuf>,
     /// The file to write; its name selects the format, and .sog gives the smallest
     #[arg(long, short)]
     pub out: PathBuf,
@@ -54,6 +54,7 @@ fn parse_target(text: &str) -> Result<CompactTarget, String> {
 
 pub fn run(args: &Args) -> Result<()> {
     use_threads(args.threads)?;
+    let data = data_for(args.data.as_deref(), &args.scene)?;
     let input = CompactInput {
         target: args.target,
         keep_psnr: args.keep_psnr,
@@ -64,7 +65,7 @@ pub fn run(args: &Args) -> Result<()> {
             ..WriteOptions::default()
         },
         seed: args.seed,
-        ..CompactInput::new(&args.scene, &args.data, &args.out)
+        ..CompactInput::new(&args.scene, &data, &args.out)
     };
     let shows_steps = stderr().is_terminal();
     let compacted = compact(&input, &mut |event| match event {

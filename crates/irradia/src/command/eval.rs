@@ -1,7 +1,7 @@
 //! `irradia eval`
 
 use super::lpips::{lpips, unseen_lpips};
-use super::{DataArgs, Split, rendering_device, thread_count, use_threads, warn, with_option_names};
+use super::{DataArgs, Split, data_for, rendering_device, thread_count, use_threads, warn, with_option_names};
 use crate::Usage;
 use crate::terminal::{note, print_line};
 use anyhow::{Result, ensure};
@@ -21,9 +21,9 @@ pub struct Args {
     /// The scene: RUN, or a file; background, filters, held-out views and the size of the photographs are taken from the run that contains
     /// it
     pub scene: PathBuf,
-    /// Dataset of photographs
+    /// Dataset of photographs; when absent that of the run that contains the scene
     #[arg(long)]
-    pub data: PathBuf,
+    pub data: Option<PathBuf>,
     /// Views to evaluate
     #[arg(long, value_enum, default_value_t = Split::Test)]
     pub split: Split,
@@ -78,7 +78,8 @@ pub fn run(args: &Args) -> Result<()> {
     use_threads(args.threads)?;
     let mut scene = Scene::read(&args.scene)?;
     warn(&scene.notes);
-    let dataset = args.reading.options().read_for(&args.scene, &args.data);
+    let data = data_for(args.data.as_deref(), &args.scene)?;
+    let dataset = args.reading.options().read_for(&args.scene, &data);
     let dataset = scene.place(dataset.map_err(with_option_names)?);
     warn(&dataset.warnings);
     let background = match (args.background, RunFolder::record_containing(&args.scene)) {
@@ -90,7 +91,7 @@ pub fn run(args: &Args) -> Result<()> {
     }
     let mut indices = args.split.of(&dataset);
     if indices.is_empty() {
-        return Err(Usage(format!("{} has no such views; try --split all", args.data.display())).into());
+        return Err(Usage(format!("{} has no such views; try --split all", data.display())).into());
     }
     let unreadable = leave_out_unreadable(&dataset, &mut indices);
     ensure!(!indices.is_empty(), unreadable.unwrap_or_default());
@@ -146,7 +147,7 @@ pub fn run(args: &Args) -> Result<()> {
     print_line(figures(&format!("mean of {}", rows.len()), &mean, nets))?;
     if let Some(path) = &args.json {
         let figures = json!({
-            "scene": scene_path(&args.scene).to_string_lossy(), "data": args.data.to_string_lossy(),
+            "scene": scene_path(&args.scene).to_string_lossy(), "data": data.to_string_lossy(),
             "splats": scene.model.splats().map(|splats| splats.len()),
             "parameters": scene.model.field().map(|field| field.len()),
             "psnr": mean.psnr, "psnr_corrected": mean.psnr_corrected, "ssim": mean.ssim, "lpips": mean.lpips, "lpips_net": nets[0].map(LpipsNet::name),

@@ -28,7 +28,7 @@ use clap::builder::RangedU64ValueParser;
 use irradia_compute::{Device, DeviceChoice};
 use irradia_runs::formats::{Lenses, SplatFormat};
 use irradia_runs::scene::Dataset;
-use irradia_runs::{Reading, ReadingOptions, RunError, open_device};
+use irradia_runs::{Reading, ReadingOptions, RunError, RunFolder, open_device};
 use std::path::{Path, PathBuf};
 
 /// A part of a dataset.
@@ -122,6 +122,18 @@ impl DataArgs {
         warn(&dataset.warnings);
         Ok(dataset)
     }
+}
+
+/// The dataset `given` with `--data`, else that of the run that contains `scene`.
+pub fn data_for(given: Option<&Path>, scene: &Path) -> Result<PathBuf> {
+    let of_run = || Some(RunFolder::record_containing(scene)?.input.data);
+    given.map(Path::to_owned).or_else(of_run).ok_or_else(|| {
+        let scene = scene.display();
+        Usage(format!(
+            "{scene}: no run contains it, so that its photographs are not known: add --data"
+        ))
+        .into()
+    })
 }
 
 /// The device that `--device` names for rendering; prints its name if it is a GPU.

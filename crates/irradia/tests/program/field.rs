@@ -38,7 +38,7 @@ fn a_field_trains_and_is_evaluated_and_rendered_like_splats() {
     let seen = json(&folder.path().join("seen.json"));
     assert!(seen["psnr"].as_f64() > Some(20.0), "{}", seen["psnr"]);
     let report = json(&folder.path().join("run/report.json"));
-    irradia(folder.path(), "eval run --data data --json figures.json").success();
+    irradia(folder.path(), "eval run --json figures.json").success();
     let figures = json(&folder.path().join("figures.json"));
     assert_eq!(figures["psnr"], report["psnr"], "a field round-trips bit for bit");
     irradia(

@@ -95,6 +95,7 @@ fn converting_says_what_it_costs_and_every_format_renders() {
     irradia(folder.path(), "convert scene.sog scene.glb").success();
     irradia(folder.path(), "render scene.glb --orbit 1 --size 32x24 --out frames").success();
     irradia(folder.path(), "eval scene.sog --data data").success();
+    irradia(folder.path(), "eval scene.sog").refused(2, &["scene.sog", "--data"]);
     let said = irradia(folder.path(), "info scene.sog").success().stdout;
     assert!(said.contains("SOG with"), "{said}");
 }

@@ -141,7 +141,7 @@ pub struct ReadingOptions {
     pub max_side: Option<u32>,
     /// Whether the size is that of the files.
     pub full_size: bool,
-    /// [`Reading::holdout`].
+    /// [`Reading::holdout`](field@Reading::holdout).
     pub holdout: Option<String>,
     /// [`Reading::images`].
     pub images: Option<PathBuf>,

@@ -17,47 +17,20 @@ const NEIGHBOUR_RANK: usize = 6;
 /// Maximum spacing, in units of its size, of a splat that is part of a surface.
 const MAX_SURFACE_SPACING: f32 = 2.0;
 
-/// Spacing of an isolated splat.
-struct IsolatedSpacing {
-    /// In units of its size.
-    sizes: f32,
-    /// In units of the scene's median spacing.
-    medians: f32,
-}
-
-const MIN_ISOLATED_SPACING: IsolatedSpacing = IsolatedSpacing {
-    sizes: 12.0,
-    medians: 4.0,
-};
-
-/// Shape of a needle.
-struct NeedleShape {
-    /// Ratio of the largest to the middle standard deviation.
-    elongation: f32,
-    /// Size relative to the distance of the nearest camera.
-    size: f32,
-}
-
-const MIN_NEEDLE_SHAPE: NeedleShape = NeedleShape {
-    elongation: 15.0,
-    size: 0.1,
-};
-
-/// Size of a huge splat, relative to the distance of the nearest camera.
+/// Minimum spacing of an isolated splat, in units of its size.
+const MIN_ISOLATED_SIZES: f32 = 12.0;
+/// The same in units of the scene's median spacing.
+const MIN_ISOLATED_MEDIANS: f32 = 4.0;
+/// Minimum ratio of the largest to the middle standard deviation of a needle.
+const MIN_NEEDLE_ELONGATION: f32 = 15.0;
+/// Minimum size of a needle, relative to the distance of the nearest camera.
+const MIN_NEEDLE_SIZE: f32 = 0.1;
+/// Minimum size of a huge splat, relative to the distance of the nearest camera.
 const MIN_HUGE_SIZE: f32 = 0.6;
-
-/// Size of a splat that is huge among smaller ones.
-struct SizeAmongSmall {
-    /// Relative to the distance of the nearest camera.
-    size: f32,
-    /// In units of its spacing: the size of a background's splats is about their spacing.
-    spacings: f32,
-}
-
-const MIN_HUGE_AMONG_SMALL: SizeAmongSmall = SizeAmongSmall {
-    size: 0.35,
-    spacings: 4.0,
-};
+/// The same for a splat that is huge among smaller ones.
+const MIN_HUGE_AMONG_SMALL: f32 = 0.35;
+/// Minimum size of such a splat in units of its spacing: the size of a background's splats is about their spacing.
+const MIN_HUGE_SPACINGS: f32 = 4.0;
 
 /// Minimum score at which photographs decide.
 const SUSPICION_THRESHOLD: f32 = 0.4;
@@ -183,13 +156,10 @@ pub fn floater_scores(draft: &Draft) -> Vec<FloaterScores> {
             let relative_spacing = spacing / largest.max(f32::MIN_POSITIVE);
             let elongation = largest / middle.max(f32::MIN_POSITIVE);
             let scores = FloaterScores {
-                isolated: (relative_spacing / MIN_ISOLATED_SPACING.sizes)
-                    .min(spacing / median_spacing / MIN_ISOLATED_SPACING.medians),
-                needle: (elongation / MIN_NEEDLE_SHAPE.elongation)
-                    .min(largest / camera_distance / MIN_NEEDLE_SHAPE.size),
+                isolated: (relative_spacing / MIN_ISOLATED_SIZES).min(spacing / median_spacing / MIN_ISOLATED_MEDIANS),
+                needle: (elongation / MIN_NEEDLE_ELONGATION).min(largest / camera_distance / MIN_NEEDLE_SIZE),
                 huge: (largest / camera_distance / MIN_HUGE_SIZE).max(
-                    (largest / camera_distance / MIN_HUGE_AMONG_SMALL.size)
-                        .min(1.0 / relative_spacing / MIN_HUGE_AMONG_SMALL.spacings),
+                    (largest / camera_distance / MIN_HUGE_AMONG_SMALL).min(1.0 / relative_spacing / MIN_HUGE_SPACINGS),
                 ),
                 ..FloaterScores::default()
             };
@@ -206,15 +176,6 @@ pub fn floater_scores(draft: &Draft) -> Vec<FloaterScores> {
         decide_by_photographs(draft, photographs, &shown, &mut scores);
     }
     scores
-}
-
-/// A pass in which photographs decide.
-#[derive(Clone, Copy, PartialEq)]
-enum Pass {
-    /// Splats with the shape of a floater, while no other splat can change to make room for them.
-    Shapes,
-    /// All suspects: also what those hid, without them.
-    Suspects,
 }
 
 /// Photographs decide about huge splats and needles: by shape alone, part of a plain wall or of a table's edge looks like one, and a veil
@@ -238,14 +199,12 @@ fn decide_by_photographs(
     let mut rest = Selection::of(draft.len(), |i| {
         shown.contains(i) && (!is_certain(&scores[i]) || shape(&scores[i]) >= SUSPICION_THRESHOLD)
     });
-    for pass in [Pass::Shapes, Pass::Suspects] {
-        let initial = match pass {
-            Pass::Shapes => InitialOpacity::Hidden,
-            Pass::Suspects => InitialOpacity::Trained,
-        };
-        let is_suspect = |scores: &FloaterScores| match pass {
-            Pass::Shapes => shape(scores) >= 1.0,
-            Pass::Suspects => shape(scores) >= SUSPICION_THRESHOLD || other(scores) >= SUSPICION_THRESHOLD,
+    for initial in [InitialOpacity::Hidden, InitialOpacity::Trained] {
+        let is_suspect = |scores: &FloaterScores| match initial {
+            // The shape of a floater, while no other splat can change to make room for it.
+            InitialOpacity::Hidden => shape(scores) >= 1.0,
+            // All suspects: also what those hid, without them.
+            InitialOpacity::Trained => shape(scores).max(other(scores)) >= SUSPICION_THRESHOLD,
         };
         let suspects = Selection::of(draft.len(), |i| rest.contains(i) && is_suspect(&scores[i]));
         for (i, is_needed) in are_needed(draft, photographs, &rest, &suspects, initial) {
@@ -253,7 +212,7 @@ fn decide_by_photographs(
             if !is_needed {
                 *scores.strongest() = scores.score().max(1.0);
                 rest.set(i as usize, false);
-            } else if pass == Pass::Suspects {
+            } else if initial == InitialOpacity::Trained {
                 for reason in [&mut scores.huge, &mut scores.needle, &mut scores.in_front] {
                     *reason = reason.min(SUSPICION_THRESHOLD);
                 }

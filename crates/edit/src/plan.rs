@@ -354,16 +354,11 @@ impl Target<'_> {
 
     /// The rotation about a point, which is filled in unless the rotation is the identity.
     fn rotation(&self, axis: [f64; 3], degrees: f64, about: &mut Option<[f64; 3]>) -> Transform {
-        let rotation = if degrees % 360.0 == 0.0 {
-            DQuat::IDENTITY
-        } else {
-            DQuat::from_axis_angle(DVec3::from(axis).normalize(), degrees.to_radians())
-        };
-        if rotation == DQuat::IDENTITY {
-            Transform::IDENTITY
-        } else {
-            Transform::about(self.pivot(about), 1.0, rotation)
+        if degrees % 360.0 == 0.0 {
+            return Transform::IDENTITY;
         }
+        let rotation = DQuat::from_axis_angle(DVec3::from(axis).normalize(), degrees.to_radians());
+        Transform::about(self.pivot(about), 1.0, rotation)
     }
 
     /// The scaling about a point, which is filled in unless the factor is 1.

@@ -25,6 +25,15 @@ impl Transform {
         translation: DVec3::ZERO,
     };
 
+    /// From the dataset's coordinates to `world`.
+    pub fn to_world(world: &Similarity) -> Self {
+        Self {
+            scale: world.scale,
+            rotation: DQuat::IDENTITY,
+            translation: world.apply(DVec3::ZERO),
+        }
+    }
+
     /// Scale and rotation about `center`.
     pub fn about(center: DVec3, scale: f64, rotation: DQuat) -> Self {
         Self {

@@ -8,7 +8,13 @@ use irradia_scene::{LoadError, Part, Photo, PhotoSource, resize_area, resize_par
 use std::path::{Path, PathBuf};
 
 /// Minimum mask value of pixels that are included in training.
-pub(crate) const MASK_THRESHOLD: u8 = 128;
+const MASK_THRESHOLD: u8 = 128;
+
+/// Sets the pixels of a mask to 255, included in training, or 0.
+pub(crate) fn binarize(mask: &mut [u8]) {
+    mask.iter_mut()
+        .for_each(|v| *v = if *v >= MASK_THRESHOLD { 255 } else { 0 });
+}
 
 /// A photograph on disk with the operations to apply when it is loaded.
 #[derive(Clone, Debug)]
@@ -152,8 +158,7 @@ impl PhotoFile {
             [mask.width, mask.height] = upright;
         }
         let mut mask = self.undistort_and_resize(mask, Part::whole(upright), size).data;
-        mask.iter_mut()
-            .for_each(|v| *v = if *v >= MASK_THRESHOLD { 255 } else { 0 });
+        binarize(&mut mask);
         Ok(mask)
     }
 }

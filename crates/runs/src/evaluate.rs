@@ -11,7 +11,7 @@ use std::ops::ControlFlow;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 /// In every warning about views without figures.
-pub(crate) const NOT_MEASURED: &str = "not measured";
+pub const NOT_MEASURED: &str = "not measured";
 
 /// Maximum bytes of the photographs that are decoded at the same time.
 const MAX_DECODED_BYTES: usize = 256 << 20;

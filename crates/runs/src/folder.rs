@@ -44,8 +44,8 @@ const WORLD: &str = "world.json";
 /// The pace of each step.
 pub(crate) const PACES: &str = "pace.txt";
 
-/// The files of a run.
-const FILES: [&str; 23] = [
+/// The files of a run other than those of [`socket::FILES`].
+const FILES: [&str; 16] = [
     "run.json",
     VIEWS,
     WORLD,
@@ -55,13 +55,6 @@ const FILES: [&str; 23] = [
     "events.jsonl",
     SCENE,
     FIELD,
-    socket::PoseRefinement::FILE,
-    RESIDUAL,
-    EXPOSURES,
-    APPEARANCE,
-    socket::BilateralGrid::FILE,
-    VIGNETTE,
-    SKY,
     "report.json",
     "report.html",
     UNIT,
@@ -70,6 +63,11 @@ const FILES: [&str; 23] = [
     "scene.lod2.ply",
     "scene.lod3.ply",
 ];
+/// All files of a run.
+fn all_files() -> impl Iterator<Item = &'static str> {
+    FILES.into_iter().chain(socket::FILES)
+}
+
 /// The subfolders of a run.
 const SUBFOLDERS: [&str; 2] = ["eval", "checkpoints"];
 
@@ -79,10 +77,8 @@ const FILES_BEFORE_RECORD: [&str; 4] = ["recipe.toml", "cameras.json", VIEWS, WO
 /// Whether the folder `path` contains a run, or may contain one. False if it contains only files of a process that died before
 /// its run had begun.
 pub(crate) fn contains_run(path: &Path) -> bool {
-    let is_before_record = |file: &&str| FILES_BEFORE_RECORD.contains(file) && FolderLock::has_lock_file(path);
-    FILES
-        .iter()
-        .any(|file| path.join(file).exists() && !is_before_record(file))
+    let is_before_record = |file| FILES_BEFORE_RECORD.contains(&file) && FolderLock::has_lock_file(path);
+    all_files().any(|file| path.join(file).exists() && !is_before_record(file))
 }
 
 /// The folder of a run.
@@ -197,13 +193,13 @@ impl RunFolder {
             None => FolderLock::acquire(path)?,
         };
         Self::check_replaceable(path, overwrite)?;
-        if FILES.iter().any(|file| path.join(file).exists()) {
+        if all_files().any(|file| path.join(file).exists()) {
             for folder in SUBFOLDERS.map(|folder| path.join(folder)) {
                 if folder.exists() {
                     fs::remove_dir_all(&folder).map_err(RunError::io("clear", &folder))?;
                 }
             }
-            for file in FILES.map(|file| path.join(file)) {
+            for file in all_files().map(|file| path.join(file)) {
                 if file.exists() {
                     fs::remove_file(&file).map_err(RunError::io("clear", &file))?;
                 }
@@ -272,8 +268,7 @@ impl RunFolder {
 
     /// `run.json` of the run that contains the scene `path`, a file or a run's folder; `None` if there is none.
     pub fn record_containing(path: &Path) -> Option<RunRecord> {
-        let folder = if path.is_dir() { path } else { path.parent()? };
-        RunRecord::parse(&fs::read(folder.join("run.json")).ok()?, folder).ok()
+        Some(Self::open(Self::containing(path)?.path()).ok()?.1)
     }
 
     /// Writes the list of training and held-out views.

@@ -73,7 +73,9 @@ pub use convert::{COMPARED_VIEWS, Conversion, convert};
 pub use describe::describe;
 pub use edit::{AppliedEdit, EDITS, Editing};
 pub use error::RunError;
-pub use evaluate::{distinct, evaluate, file_stem, file_stems, leave_out_unreadable, psnr_8_bits, unmeasured};
+pub use evaluate::{
+    NOT_MEASURED, distinct, evaluate, file_stem, file_stems, leave_out_unreadable, psnr_8_bits, unmeasured,
+};
 pub use folder::{
     FIELD, POSED_FOLDER, RESIDUAL, RunFolder, RunRecord, SCENE, is_moved, moved_from_run, write_own_cameras,
 };

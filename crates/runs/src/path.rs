@@ -8,7 +8,7 @@
 use crate::{RunError, Scene};
 use glam::{DVec3, Mat3, Quat, Vec3};
 use irradia_edit::Transform;
-use irradia_scene::{Camera, Intrinsics, Pose, Similarity};
+use irradia_scene::{Camera, Intrinsics, Pose};
 use serde::{Deserialize, Serialize};
 use std::f32::consts::TAU;
 use std::fs;
@@ -84,16 +84,15 @@ pub struct Film {
 }
 
 impl Film {
-    /// Reads a path saved by the viewer, or a `camera_path.json` of nerfstudio. Both are in the coordinates of the photographs, from which
-    /// the whole scene was `moved` ([`moved_from_run`](crate::moved_from_run)); `world` is the scene's. Frames have `width` x `height`
-    /// pixels.
+    /// Reads a path saved by the viewer, or a `camera_path.json` of nerfstudio. Both are in the coordinates of the photographs, which
+    /// `world_from_photographs` maps to the scene's world, also if the whole scene was moved
+    /// ([`moved_from_run`](crate::moved_from_run)). Frames have `width` x `height` pixels.
     ///
     /// # Errors
     /// When the file cannot be read, or is not such a path.
     pub fn read(
         path: &Path,
-        moved: &Transform,
-        world: &Similarity,
+        world_from_photographs: &Transform,
         (width, height): (u32, u32),
     ) -> Result<Self, RunError> {
         let text = fs::read_to_string(path).map_err(RunError::io("read", path))?;
@@ -109,7 +108,7 @@ impl Film {
                 .camera_path
                 .iter()
                 .take(MAX_FRAMES)
-                .map(|c| c.camera(moved, world, width, height))
+                .map(|c| c.camera(world_from_photographs, width, height))
                 .collect();
             let cameras = cameras.filter(|cameras| !cameras.is_empty());
             return Ok(Self {
@@ -119,7 +118,7 @@ impl Film {
         }
         let mut path: CameraPath =
             serde_json::from_value(value).map_err(|error| wrong(&format!("not a camera path: {error}")))?;
-        path.keys.iter_mut().for_each(|key| key.move_to_world(moved, world));
+        path.keys.iter_mut().for_each(|key| key.move_by(world_from_photographs));
         path.check().map_err(wrong)?;
         Ok(path.film((width, height)))
     }
@@ -231,17 +230,16 @@ fn resized_intrinsics(k: Intrinsics, size: Option<(u32, u32)>) -> Intrinsics {
 }
 
 impl PathKey {
-    /// Brings the key from the coordinates of the photographs to the `world` of the scene that was `moved`.
-    fn move_to_world(&mut self, moved: &Transform, world: &Similarity) {
+    fn move_by(&mut self, transform: &Transform) {
         let [w, x, y, z] = self.rotation;
-        let rotation = moved.rotation.as_quat() * Quat::from_xyzw(x, y, z, w);
+        let rotation = transform.rotation.as_quat() * Quat::from_xyzw(x, y, z, w);
         self.rotation = [rotation.w, rotation.x, rotation.y, rotation.z];
-        self.position = world.apply(moved.apply(self.position.into())).to_array();
+        self.position = transform.apply(self.position.into()).to_array();
     }
 }
 
 impl NerfstudioCamera {
-    fn camera(&self, moved: &Transform, world: &Similarity, width: u32, height: u32) -> Option<Camera> {
+    fn camera(&self, world_from_photographs: &Transform, width: u32, height: u32) -> Option<Camera> {
         let m = &self.camera_to_world;
         if m.len() < 12 || m.iter().any(|v| !v.is_finite()) || !(self.fov > 0.0 && self.fov < 180.0) {
             return None;
@@ -249,8 +247,9 @@ impl NerfstudioCamera {
         let column = |c: usize| DVec3::new(m[c], m[4 + c], m[8 + c]);
         let [x, y, z] = [column(0), -column(1), -column(2)].map(|axis| axis.normalize_or_zero().as_vec3());
         let pose = Pose {
-            rotation: (moved.rotation.as_quat() * Quat::from_mat3(&Mat3::from_cols(x, y, z))).normalize(),
-            position: world.apply(moved.apply(column(3))).as_vec3(),
+            rotation: (world_from_photographs.rotation.as_quat() * Quat::from_mat3(&Mat3::from_cols(x, y, z)))
+                .normalize(),
+            position: world_from_photographs.apply(column(3)).as_vec3(),
         };
         pose.is_valid()
             .then(|| camera_with_fov(pose, self.fov.to_radians(), width, height))
@@ -436,6 +435,7 @@ fn slerp(a: Quat, b: Quat, t: f32) -> Quat {
 mod tests {
     use super::*;
     use glam::DQuat;
+    use irradia_scene::Similarity;
     use irradia_splat::{RenderOptions, Splats};
     use irradia_train::model::Model;
 
@@ -531,7 +531,7 @@ mod tests {
         let file = folder.path().join("path.json");
         let write = |text: &str| fs::write(&file, text).expect("written");
         write(&serde_json::to_string(&path(false)).expect("plain data"));
-        let film = Film::read(&file, &Transform::IDENTITY, &Similarity::IDENTITY, (64, 48)).expect("a path");
+        let film = Film::read(&file, &Transform::IDENTITY, (64, 48)).expect("a path");
         assert_eq!((film.cameras.len(), film.fps), (46, 10.0));
         write(
             r#"{"fps": 24, "render_width": 5, "camera_path": [
@@ -541,9 +541,9 @@ mod tests {
             scale: 0.5,
             center: DVec3::new(1.0, 0.0, -1.0),
         };
-        let scaled = Film::read(&file, &Transform::IDENTITY, &world, (64, 48)).expect("a path");
+        let scaled = Film::read(&file, &Transform::to_world(&world), (64, 48)).expect("a path");
         assert_eq!(scaled.cameras[0].pose.position, Vec3::new(1.0, 2.0, 3.0));
-        let film = Film::read(&file, &Transform::IDENTITY, &Similarity::IDENTITY, (64, 48)).expect("a path");
+        let film = Film::read(&file, &Transform::IDENTITY, (64, 48)).expect("a path");
         let camera = film.cameras[0];
         assert_eq!((film.fps, camera.pose.position), (24.0, Vec3::new(3.0, 4.0, 5.0)));
         // OpenGL looks along -z with y up.
@@ -568,7 +568,7 @@ mod tests {
             scale: 0.1,
             center: far,
         };
-        let film = Film::read(&file, &moved, &world, (64, 48)).expect("a path");
+        let film = Film::read(&file, &moved.then(&Transform::to_world(&world)), (64, 48)).expect("a path");
         for (i, camera) in film.cameras.iter().enumerate() {
             let unmoved = path(false).camera(i as f32 / 10.0, 64, 48);
             let expected = 0.2 * (turn.as_quat() * unmoved.pose.position);
@@ -598,7 +598,7 @@ mod tests {
             good.replacen("[0.0,0.0,-0.0]", "[1e300,0.0,0.0]", 1),
         ] {
             fs::write(&file, &text).expect("written");
-            let error = Film::read(&file, &Transform::IDENTITY, &Similarity::IDENTITY, (8, 8))
+            let error = Film::read(&file, &Transform::IDENTITY, (8, 8))
                 .expect_err(&text)
                 .to_string();
             assert!(!error.contains('\n') && error.contains("path.json"), "{error}");

@@ -1,8 +1,8 @@
 //! Reduced photographs of a run, for the search for floaters.
 
+use crate::RunFolder;
 use crate::folder::{camera_names_beside, is_moved};
 use crate::scene_file::render_settings_beside;
-use crate::{RunFolder, TrainInput};
 use irradia_edit::{LoadedPhotographs, Photographs};
 use irradia_scene::Photo;
 use rayon::prelude::*;
@@ -22,7 +22,7 @@ pub fn photographs_of(scene: &Path) -> Option<Photographs> {
 }
 
 fn read(scene: &Path) -> Option<LoadedPhotographs> {
-    let input = TrainInput::of_run(scene.parent()?).ok()?;
+    let input = RunFolder::record_containing(scene)?.input;
     let dataset = input.reading.read(&input.data).ok()?;
     // The scene's cameras are pinholes: photographs with distortion or a rolling shutter do not match them.
     if dataset.views.iter().any(|view| !view.camera.is_pinhole()) {

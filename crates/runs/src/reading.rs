@@ -107,9 +107,8 @@ impl Reading {
 
     /// Whether `holdout` is a list that is not there any more.
     pub(crate) fn is_holdout_list_missing(&self) -> bool {
-        let is_list = |text: &String| text.parse::<usize>().is_err();
-        let list = self.holdout.as_ref().filter(|text| is_list(text));
-        list.is_some_and(|file| !Path::new(file).is_file())
+        // Settings of a run are valid but for what has become of their files.
+        self.holdout().is_err()
     }
 
     /// Makes the paths in `holdout` and `images` absolute.

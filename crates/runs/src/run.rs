@@ -87,15 +87,8 @@ impl Run {
             // The splats were trained on all others, or are to be trained again on the same ones.
             run.restore_holdout(&mut dataset)?;
         }
-        // Before unreadable photographs are left out: once they are restored, they are held out again.
+        // Before unreadable photographs are left out below: once they are restored, they are held out again.
         let views = ViewList::of(&dataset);
-        hold_out_readable(&mut dataset);
-        if dataset.test.is_empty()
-            && let Some(psnr) = request.input.until_psnr
-        {
-            let message = "no view is held out, or none can be read, so PSNR cannot be measured";
-            return Err(RunError::setting("until_psnr", psnr, message));
-        }
         request.apply_unhurried_changes()?;
         request.choose_background(&dataset)?;
         request.choose_length(&dataset);
@@ -104,6 +97,13 @@ impl Run {
         let existing_lock = FolderLock::acquire_existing(out)?;
         let paces = request.paces()?;
         let options = train_options(&request)?;
+        hold_out_readable(&mut dataset);
+        if dataset.test.is_empty()
+            && let Some(psnr) = request.input.until_psnr
+        {
+            let message = "no view is held out, or none can be read, so PSNR cannot be measured";
+            return Err(RunError::setting("until_psnr", psnr, message));
+        }
         let (dataset, found) = request.with_points(dataset);
         let mut trainer = new_trainer(&request, Arc::new(dataset), options)?;
         found.into_iter().for_each(|message| trainer.add_decision(message));
@@ -142,10 +142,10 @@ impl Run {
             folder.restore_holdout(&mut dataset)?;
         }
         let views = ViewList::of(&dataset);
-        hold_out_readable(&mut dataset);
         let lock = FolderLock::acquire(folder.path())?;
         folder.remove_leftovers()?;
         let options = train_options(&request)?;
+        hold_out_readable(&mut dataset);
         let paces = request.paces()?;
         // The world in which the previous steps were made; an earlier version may have chosen another one.
         let (dataset, _) = request.with_points(dataset.in_world(folder.world_from_dataset()?));

@@ -118,10 +118,8 @@ impl Splats {
     /// Highest SH degree with a coefficient other than zero.
     pub fn used_sh_degree(&self) -> u32 {
         let is_used = |degree: &u32| {
-            let planes = 3 * sh::coefficients(degree - 1)..3 * sh::coefficients(*degree);
-            planes
-                .into_iter()
-                .any(|c| self.sh.plane(c)[..self.len()].iter().any(|v| *v != 0.0))
+            let mut planes = 3 * sh::coefficients(degree - 1)..3 * sh::coefficients(*degree);
+            planes.any(|c| self.sh.plane(c)[..self.len()].iter().any(|v| *v != 0.0))
         };
         (1..=self.sh_degree()).rev().find(is_used).unwrap_or(0)
     }

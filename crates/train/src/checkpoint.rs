@@ -317,8 +317,6 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
     let progress = read_progress(&file)?;
     let mut trainer = Trainer::with_empty_state(dataset, recipe, TrainOptions { seed, ..options }, state.len())?;
     trainer.initial_splats = first_count(&trainer.dataset, &trainer.recipe).min(state.len());
-    // A run begins with more bands than its recipe has at that step only if its first splats had them.
-    trainer.first_sh_degree = state.splats.used_sh_degree();
     *trainer.engine.state_mut() = state;
     restore_field(&mut trainer, &file)?;
     restore_occupants(&mut trainer, &file)?;

@@ -192,7 +192,7 @@ impl Trainer {
             },
             trained_fraction: plan.value(Param::TrainedShare),
             rates,
-            sh_degree: plan.sh_degree.max(self.first_sh_degree),
+            sh_degree: plan.sh_degree,
             optimizer: Optimizer {
                 step: AdamStep {
                     beta1: adam.beta1,

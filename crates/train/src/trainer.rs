@@ -172,8 +172,6 @@ pub struct Trainer {
     pub(crate) spacing: f64,
     /// The surroundings of sparse photographs; absent if the recipe has no free space.
     pub(crate) surroundings: Option<Surroundings>,
-    /// The SH bands that the first splats already had. They are in use from the first step on, whatever the recipe says.
-    pub(crate) first_sh_degree: u32,
 }
 
 impl Trainer {
@@ -201,22 +199,23 @@ impl Trainer {
     }
 
     /// Begins with `splats`, in the world of `dataset`, instead of the dataset's points or a field. Bands that they do not have are not
-    /// trained. The recipe's `render.antialias` must be that of the splats.
+    /// trained; those that they use are shown from the first step on. The recipe's `render.antialias` must be that of the splats.
     ///
     /// # Errors
     /// When there are no training views, no splats, or too little memory for them.
     pub fn from_splats(
         dataset: Arc<Dataset>,
-        recipe: Recipe,
+        mut recipe: Recipe,
         options: TrainOptions,
         splats: Splats,
     ) -> Result<Self, TrainError> {
         if splats.is_empty() {
             return Err(TrainError::NoSplats);
         }
+        // In the recipe, so that forecasts, the report and a resumed run have the same bands.
+        recipe.keep_sh_bands(splats.used_sh_degree());
         let mut trainer = Self::with_empty_state(dataset, recipe, options, splats.len())?;
         trainer.apply_data_conditions()?;
-        trainer.first_sh_degree = splats.used_sh_degree();
         *trainer.engine.state_mut() = SplatState::new(splats);
         trainer.sockets = trainer.first_sockets()?;
         Ok(trainer)
@@ -281,7 +280,6 @@ impl Trainer {
                 .flatten(),
             engine,
             field: None,
-            first_sh_degree: 0,
             sockets: Sockets::default(),
             trained: dataset.train.clone(),
             hidden: Hidden::default(),
@@ -492,12 +490,12 @@ impl Trainer {
         ended
     }
 
-    /// How this run's frames are rendered, with SH up to `sh_degree` and those that the first splats had.
+    /// How this run's frames are rendered, with SH up to `sh_degree`.
     pub fn render_options(&self, sh_degree: u32) -> RenderOptions {
         let sky = self.sockets.sky.as_ref();
         RenderOptions {
             background: sky.map_or(self.recipe.render.background, Sky::background),
-            sh_degree: sh_degree.max(self.first_sh_degree),
+            sh_degree,
             antialias: self.recipe.render.antialias,
             ..RenderOptions::default()
         }

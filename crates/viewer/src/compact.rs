@@ -30,7 +30,7 @@ pub(crate) const fn band_bytes(degree: u32) -> usize {
     16 * degree as usize
 }
 
-/// `splats` in compact form, with bands up to `degree`, the `max_splats` important of them. Splats that can never be seen are left out.
+/// `splats` in compact form, with bands up to `degree`: at most `max_splats` of them, the most important. Splats that can never be seen are left out.
 pub(crate) fn compact(splats: &Splats, degree: u32, max_splats: usize) -> Vec<u8> {
     let mut order = by_importance(splats);
     order.truncate(max_splats);

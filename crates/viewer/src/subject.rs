@@ -1,7 +1,7 @@
 //! What is shown: a finished scene, or the state of a training.
 
 use crate::ViewerError;
-use crate::editing::{Editing, to_world};
+use crate::editing::Editing;
 use crate::levels::Levels;
 use crate::live::{Live, Watcher};
 use crate::views::Views;
@@ -53,7 +53,7 @@ impl Edition {
             splats_version: 1,
             selected: None,
             placement: Transform::IDENTITY,
-            opened: moved.then(&to_world(&scene.world_from_dataset)),
+            opened: moved.then(&Transform::to_world(&scene.world_from_dataset)),
             levels,
             lights: lights.map(Arc::new),
             source: SceneSource::Scene(Arc::new(scene)),
@@ -74,7 +74,7 @@ impl Edition {
         let scene = self.scene();
         match &scene.cameras {
             Some(_) => self.opened.then(&self.placement),
-            None => to_world(&scene.world_from_dataset),
+            None => Transform::to_world(&scene.world_from_dataset),
         }
     }
 
@@ -260,7 +260,7 @@ impl Subject {
                     splats_version: version,
                     selected: None,
                     placement: Transform::IDENTITY,
-                    opened: to_world(&snapshot.scene.world_from_dataset),
+                    opened: Transform::to_world(&snapshot.scene.world_from_dataset),
                     levels: Levels::default(),
                     lights: snapshot.lights.clone(),
                     source: SceneSource::Snapshot(snapshot),

@@ -102,6 +102,7 @@ fn check_files() -> Result<Vec<String>> {
 
 /// Shell scripts that bash cannot parse. `.ci/run` is one of them, so nothing in it can find this out.
 fn check_scripts() -> Result<Vec<String>> {
+    let root = repository()?;
     let mut violations = Vec::new();
     for (path, text) in tracked_files("*")? {
         let first_line = text.split(|&byte| byte == b'\n').next().unwrap_or_default();
@@ -110,7 +111,7 @@ fn check_scripts() -> Result<Vec<String>> {
         }
         let parsed = Command::new("bash")
             .arg("-n")
-            .arg(repository()?.join(&path))
+            .arg(root.join(&path))
             .output()
             .context("cannot run bash")?;
         if !parsed.status.success() {

@@ -7,7 +7,7 @@ mod panorama;
 use crate::dataset::{SiblingFolder, colmap_orientation, is_image_name, list_files, oriented_size};
 use crate::error::read_file;
 use crate::image_file::{Colour, decode, decode_jpeg_scaled, decode_mask, read_header, read_metadata};
-use crate::photo::MASK_THRESHOLD;
+use crate::photo::binarize;
 use crate::{FormatError, Pixels, write_png};
 pub use exif::{CameraTags, parse_camera_tags};
 pub use gimbal::parse_gimbal;
@@ -125,9 +125,7 @@ impl PhotoEntry {
     pub fn write_mask(&self, path: &Path) -> Result<(), FormatError> {
         let Some(mask) = &self.mask else { return Ok(()) };
         let mut mask = decode_mask(mask, Orientation::NoTransforms)?;
-        for value in &mut mask.data {
-            *value = if *value >= MASK_THRESHOLD { 255 } else { 0 };
-        }
+        binarize(&mut mask.data);
         write_png(path, mask.width, mask.height, 1, &mask.data)
     }
 }

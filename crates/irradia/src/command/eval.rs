@@ -10,8 +10,8 @@ use irradia_runs::formats::write_atomic;
 use irradia_runs::train::eval::{EvalOptions, EvaluatedView, Metrics};
 use irradia_runs::train::half_fit::HalfFit;
 use irradia_runs::{
-    Background, HOW_TO_GET_LPIPS, RunFolder, Scene, evaluate, file_stems, leave_out_unreadable, read_vignette,
-    scene_path, unmeasured, write_image,
+    Background, HOW_TO_GET_LPIPS, Scene, evaluate, file_stems, leave_out_unreadable, read_vignette, scene_path,
+    unmeasured, write_image,
 };
 use serde_json::json;
 use std::path::{Path, PathBuf};
@@ -82,9 +82,9 @@ pub fn run(args: &Args) -> Result<()> {
     let dataset = args.reading.options().read_for(&args.scene, &data);
     let dataset = scene.place(dataset.map_err(with_option_names)?);
     warn(&dataset.warnings);
-    let background = match (args.background, RunFolder::record_containing(&args.scene)) {
-        (None, None) if !has_background(&args.scene) => Background::default_for(&dataset, false)?,
-        (given, _) => given,
+    let background = match args.background {
+        None if !has_background(&args.scene) => Background::default_for(&dataset, false)?,
+        given => given,
     };
     if let Some(background) = background {
         scene.options.background = background.color();

@@ -6,6 +6,7 @@ use super::{DataArgs, Split, rendering_device, thread_count, use_threads, warn};
 use crate::Usage;
 use crate::terminal::print_line;
 use anyhow::{Context, Result};
+use irradia_edit::Transform;
 use irradia_runs::scene::{Camera, Image};
 use irradia_runs::train::painter::Painter;
 use irradia_runs::{Film, Scene, file_stems, is_film_name, moved_from_run, scene_path, write_image};
@@ -120,12 +121,8 @@ pub(super) fn film_from_path(
         _ => {
             let k = scene.orbit_geometry().intrinsics;
             let moved = moved_from_run(&scene_path(source));
-            Film::read(
-                path,
-                &moved,
-                &scene.world_from_dataset,
-                size.unwrap_or((k.width, k.height)),
-            )?
+            let world_from_photographs = moved.then(&Transform::to_world(&scene.world_from_dataset));
+            Film::read(path, &world_from_photographs, size.unwrap_or((k.width, k.height)))?
         }
     })
 }

@@ -13,8 +13,8 @@ use clap::builder::RangedU64ValueParser;
 use irradia_compute::DeviceChoice;
 use irradia_runs::scene::Dataset;
 use irradia_runs::{
-    Background, DEFAULT_RECIPE, Finished, PoseCheck, PoseSource, Reading, Run, RunError, RunFolder, TrainInput,
-    TrainRequest, check_poses, pose_source,
+    Background, DEFAULT_RECIPE, Finished, NOT_MEASURED, PoseCheck, PoseSource, Reading, Run, RunError, RunFolder,
+    TrainInput, TrainRequest, check_poses, pose_source,
 };
 use irradia_train::event::Observer;
 use std::path::{Path, PathBuf};
@@ -448,7 +448,7 @@ fn print_summary(finished: &Finished) -> Result<()> {
         &report
             .warnings
             .iter()
-            .filter(|line| line.contains("not measured"))
+            .filter(|line| line.contains(NOT_MEASURED))
             .cloned()
             .collect::<Vec<_>>(),
     );

@@ -105,20 +105,18 @@ impl DepthLoss {
         frame.assert_lengths(gradient, frame.depth.len());
         self.collect(frame, samples);
         let (fit, norm) = match kind {
-            DepthKind::Metric => (Fit::NONE, self.sum(|s| s.weight * s.given)),
+            DepthKind::Metric => (Some(Fit::NONE), self.sum(|s| s.weight * s.given)),
             DepthKind::Relative => (Fit::least_squares(&self.counted), self.sum(|s| s.weight * s.rendered)),
         };
-        // Also false for NaN; without samples the loss stays 0. Depths that rise where the render falls show something else: a fit of scale
-        // 0 would pull the whole view to one depth.
-        let sound = norm > 0.0 && norm.is_finite() && fit.scale > 0.0;
-        if !sound {
+        // Also false for NaN; without samples the loss stays 0.
+        let Some(fit) = fit.filter(|_| norm > 0.0 && norm.is_finite()) else {
             return DepthValues {
                 loss: 0.0,
                 samples: 0,
                 scale: 1.0,
                 shift: 0.0,
             };
-        }
+        };
         let loss = self.sum(|s| s.weight * fit.residual(s).abs()) / norm;
         let signed = |s: &Counted| s.weight * sign(fit.residual(s));
         let (by_shift, by_scale) = (self.sum(signed), self.sum(|s| signed(s) * (s.given - fit.mean_given)));
@@ -191,8 +189,9 @@ impl Fit {
         weight: 1.0,
     };
 
-    /// By weighted least squares.
-    fn least_squares(samples: &[Counted]) -> Self {
+    /// By weighted least squares; `None` unless the scale is positive. Depths that rise where the render falls show something else: a scale
+    /// of 0 would pull the whole view to one depth.
+    fn least_squares(samples: &[Counted]) -> Option<Self> {
         let sum = |of: &dyn Fn(&Counted) -> f64| samples.iter().map(|s| s.weight * of(s)).sum::<f64>();
         let weight = sum(&|_| 1.0);
         let (mean_given, mean_rendered) = (sum(&|s| s.given) / weight, sum(&|s| s.rendered) / weight);
@@ -200,14 +199,14 @@ impl Fit {
         let covariance = sum(&|s| (s.given - mean_given) * (s.rendered - mean_rendered)) / weight;
         // A spread that is only rounding error determines no scale.
         let fits = covariance > 0.0 && variance > 1e-12 * mean_given * mean_given;
-        let scale = if fits { covariance / variance } else { 0.0 };
-        Self {
+        let scale = covariance / variance;
+        fits.then(|| Self {
             scale,
             shift: mean_rendered - scale * mean_given,
             mean_given,
-            inverse_variance: if fits { 1.0 / variance } else { 0.0 },
+            inverse_variance: 1.0 / variance,
             weight,
-        }
+        })
     }
 
     fn residual(&self, s: &Counted) -> f64 {
@@ -218,6 +217,7 @@ impl Fit {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::loss::picture::depth_gradient;
     use irradia_scene::Rng;
     use irradia_testkit::finite_differences::{FiniteDifferences, sample_indices};
 
@@ -246,15 +246,9 @@ mod tests {
     }
 
     fn value(depth: &[f64], alpha: &[f64], samples: &[DepthSample], kind: DepthKind) -> (DepthValues, [Vec<f64>; 2]) {
-        let mut v = [vec![0.0; depth.len()], vec![0.0; depth.len()]];
-        let [v_depth, v_alpha] = &mut v;
-        let mut gradient = DepthGradient {
-            depth: v_depth,
-            alpha: v_alpha,
-        };
-        let frame = DepthPlanes { depth, alpha };
-        let values = DepthLoss::default().run(frame, samples, kind, 1.0, &mut gradient);
-        (values, v)
+        depth_gradient(depth.len(), 0.0, |gradient| {
+            DepthLoss::default().run(DepthPlanes { depth, alpha }, samples, kind, 1.0, gradient)
+        })
     }
 
     #[test]
@@ -357,16 +351,13 @@ mod tests {
         let (depth, alpha, samples) = random(6);
         let (want, [v_want, _]) = value(&depth, &alpha, &samples, DepthKind::Relative);
         let single = |v: &[f64]| v.iter().map(|v| *v as f32).collect::<Vec<f32>>();
-        let (mut v_depth, mut v_alpha) = (vec![1.0; PIXELS], vec![0.0; PIXELS]);
         let frame = DepthPlanes {
             depth: &single(&depth),
             alpha: &single(&alpha),
         };
-        let mut gradient = DepthGradient {
-            depth: &mut v_depth,
-            alpha: &mut v_alpha,
-        };
-        let got = DepthLoss::default().evaluate(frame, &samples, DepthKind::Relative, 2.0, &mut gradient);
+        let (got, [v_depth, _]) = depth_gradient(PIXELS, 1.0, |gradient| {
+            DepthLoss::default().evaluate(frame, &samples, DepthKind::Relative, 2.0, gradient)
+        });
         assert!((got.loss - want.loss).abs() < 1e-6);
         for (got, want) in v_depth.iter().zip(&v_want) {
             assert!((f64::from(*got) - 1.0 - 2.0 * want).abs() < 1e-5, "{got} {want}");

@@ -160,6 +160,7 @@ impl Stencil {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::loss::picture::depth_gradient;
     use irradia_scene::Rng;
     use irradia_testkit::finite_differences::{FiniteDifferences, sample_indices};
 
@@ -195,15 +196,9 @@ mod tests {
     }
 
     fn value(depth: &[f64], alpha: &[f64], samples: &[NormalSample]) -> (f64, [Vec<f64>; 2]) {
-        let mut v = [vec![0.0; depth.len()], vec![0.0; depth.len()]];
-        let [v_depth, v_alpha] = &mut v;
-        let mut gradient = DepthGradient {
-            depth: v_depth,
-            alpha: v_alpha,
-        };
-        let frame = DepthPlanes { depth, alpha };
-        let loss = NormalLoss::default().run(frame, &camera(), samples, 2, 1.0, &mut gradient);
-        (loss, v)
+        depth_gradient(depth.len(), 0.0, |gradient| {
+            NormalLoss::default().run(DepthPlanes { depth, alpha }, &camera(), samples, 2, 1.0, gradient)
+        })
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Test images for the losses.
 
-use super::{Target, Truth};
+use super::{DepthGradient, Target, Truth};
 use irradia_scene::{Image, Rng};
 
 /// A render, a truth and an optional mask, planar.
@@ -53,4 +53,19 @@ impl Picture {
         let data = (0..3 * pixels).map(|i| planar[i % 3 * pixels + i / 3] as f32).collect();
         Image::new(self.width as u32, self.height as u32, 3, data)
     }
+}
+
+/// The result of `loss`, and its gradients with respect to depth and opacity, added to planes of `pixels` times `first`.
+pub(super) fn depth_gradient<T: Copy, R>(
+    pixels: usize,
+    first: T,
+    loss: impl FnOnce(&mut DepthGradient<T>) -> R,
+) -> (R, [Vec<T>; 2]) {
+    let [mut depth, mut alpha] = [vec![first; pixels], vec![first; pixels]];
+    let mut gradient = DepthGradient {
+        depth: &mut depth,
+        alpha: &mut alpha,
+    };
+    let result = loss(&mut gradient);
+    (result, [depth, alpha])
 }

@@ -224,7 +224,7 @@ fn edge<T: Real>(target: &Target<T>, a: usize, b: usize, edges: &[T], k: f64) ->
 
 #[cfg(test)]
 mod tests {
-    use super::super::picture::Picture;
+    use super::super::picture::{Picture, depth_gradient};
     use super::*;
     use irradia_scene::Rng;
     use irradia_testkit::finite_differences::{FiniteDifferences, sample_indices};
@@ -239,15 +239,9 @@ mod tests {
     }
 
     fn value(depth: &[f64], alpha: &[f64], target: &Target<f64>, settings: &SmoothSettings) -> (f64, [Vec<f64>; 2]) {
-        let mut v = [vec![0.0; depth.len()], vec![0.0; depth.len()]];
-        let [v_depth, v_alpha] = &mut v;
-        let mut gradient = DepthGradient {
-            depth: v_depth,
-            alpha: v_alpha,
-        };
-        let frame = DepthPlanes { depth, alpha };
-        let loss = Memory::default().evaluate(frame, target, settings, &mut gradient);
-        (loss, v)
+        depth_gradient(depth.len(), 0.0, |gradient| {
+            Memory::default().evaluate(DepthPlanes { depth, alpha }, target, settings, gradient)
+        })
     }
 
     /// Alpha from 0.2 up, accumulated depth of 1 to 4.
@@ -346,26 +340,25 @@ mod tests {
                 truth,
                 mask: picture.mask.as_deref(),
             };
-            let (mut v_depth, mut v_alpha) = (vec![first; 682], vec![first; 682]);
             let frame = DepthPlanes {
                 depth: &depth,
                 alpha: &alpha,
             };
-            let mut gradient = DepthGradient {
-                depth: &mut v_depth,
-                alpha: &mut v_alpha,
-            };
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            let loss = pool.install(|| {
-                SmoothLoss::default().evaluate(frame, &target, Smoothed::Disparity, 8.0, 3.0, &mut gradient)
-            });
-            (loss, v_depth, v_alpha)
+            depth_gradient(682, first, |gradient| {
+                pool.install(|| SmoothLoss::default().evaluate(frame, &target, Smoothed::Disparity, 8.0, 3.0, gradient))
+            })
         };
         let one = run(Truth::Rgb8(&bytes), 1, 0.0);
         assert_eq!(run(Truth::Rgb8(&bytes), 3, 0.0), one);
         let planar = run(Truth::Planar(&rounded), 2, 0.0);
         assert!((planar.0 - one.0).abs() < 1e-6, "{} {}", planar.0, one.0);
         let added = run(Truth::Rgb8(&bytes), 2, 0.5);
-        assert!(added.1.iter().zip(&one.1).all(|(a, b)| (a - 0.5 - b).abs() < 1e-6));
+        assert!(
+            added.1[0]
+                .iter()
+                .zip(&one.1[0])
+                .all(|(a, b)| (a - 0.5 - b).abs() < 1e-6)
+        );
     }
 }

@@ -75,7 +75,7 @@ pub(super) fn band<S: Simd>(
         *w = simd.splat(value);
     }
     let mut sums = Sums::default();
-    // Rows are numbered such that the first row the band reads, possibly above the image, is RING.
+    // Rows are numbered such that the first row the band reads, possibly above the image, is [`RING_ROWS`].
     let first = RING_ROWS + 2 * RADIUS;
     let last = first + job.rows.len();
     let image_row = |row: usize| {

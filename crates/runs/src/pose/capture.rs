@@ -113,7 +113,6 @@ pub(super) fn prepare_folder(folder: &Path, record: &str) -> Result<(), RunError
         }
         fs::remove_dir_all(folder).map_err(RunError::io("clear", folder))?;
     }
-    fs::create_dir_all(folder).map_err(RunError::io("create", folder))?;
     write_atomic(&record, |file| file.write_all(b"[]\n"))?;
     Ok(())
 }

@@ -3,7 +3,7 @@
 use super::capture::{Capture, prepare_folder};
 use super::import;
 use super::stages::max_features;
-use super::{LeftOutPhoto, PoseInput, PoseProgress, PoseReport, join_paths, output};
+use super::{LeftOutPhoto, PoseInput, PoseProgress, PoseReport, PoseSource, join_paths, output};
 use crate::RunError;
 use irradia_formats::{PhotoEntry, PhotoFolder, read_colmap_poses};
 use rayon::prelude::*;
@@ -122,6 +122,7 @@ fn report(out: &Path, folder: &PhotoFolder) -> Result<PoseReport, RunError> {
         left_out,
         models: vec![images.len()],
         points: points.len(),
+        poses_by: PoseSource::Colmap,
         ..PoseReport::default()
     })
 }

@@ -57,8 +57,8 @@ fn ffmpeg_version() -> Option<String> {
         .stdin(Stdio::null())
         .output()
         .ok()?;
-    let stderr_text = String::from_utf8_lossy(&output.stdout).into_owned();
-    output.status.success().then_some(stderr_text)
+    let version = String::from_utf8_lossy(&output.stdout).into_owned();
+    output.status.success().then_some(version)
 }
 
 /// The option that makes ffmpeg of this `version` pass every frame once: `-fps_mode` is new in 5.1, and later versions removed `-vsync`.

@@ -322,14 +322,14 @@ fn check_input(input: &PoseInput) -> Result<(), RunError> {
     }
     if input.mapper == Mapper::Colmap && !input.distances.is_empty() {
         return Err(RunError::setting(
-            "mapper",
+            "poses",
             "colmap",
             "COLMAP's poses are not scaled: leave out --distance or --poses colmap",
         ));
     }
     if input.mapper == Mapper::Colmap && input.into {
         return Err(RunError::setting(
-            "mapper",
+            "poses",
             "colmap",
             "COLMAP cannot add photographs to a dataset: leave out --into or --poses colmap",
         ));
@@ -373,10 +373,7 @@ impl Posing<'_> {
     fn pose_with_colmap(&mut self) -> Result<PoseReport, RunError> {
         let report = colmap::run(self.input, self.capture, self.progress)?;
         self.clock.end("colmap");
-        Ok(PoseReport {
-            poses_by: PoseSource::Colmap,
-            ..report
-        })
+        Ok(report)
     }
 
     /// Finds the poses, or those of photographs that are not `known`, and writes them; returns the report without times.

@@ -35,7 +35,6 @@ pub(super) fn write(
     let written = begin_models(out)?;
     for (number, model) in found.models.iter().enumerate() {
         let to = written.join(number.to_string());
-        fs::create_dir_all(&to).map_err(RunError::io("create", &to))?;
         write_colmap(&to, &colmap_model(work, infos, model))?;
     }
     match known_model {

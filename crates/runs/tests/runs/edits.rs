@@ -10,6 +10,7 @@ use irradia_runs::synth::{SceneName, SynthLens, dataset as traced};
 use irradia_runs::train::eval::{EvalOptions, Metrics};
 use irradia_runs::train::event::{Event, Observer, Signal};
 use irradia_runs::train::half_fit::HalfFit;
+use irradia_runs::train::schedule::plan;
 use irradia_runs::{EDITS, Editing};
 use irradia_splat::logit;
 use std::fs;
@@ -201,7 +202,7 @@ fn a_training_begins_with_the_splats_of_a_scene() {
     let mut run = Run::begin_on(from.clone().check().expect("a request"), dataset()).expect("a run");
     let splats = run.trainer().engine.state().splats.clone();
     assert_eq!(splats.len(), first.splats as usize);
-    let shown = run.trainer().render_options(0).sh_degree;
+    let shown = plan(&run.trainer().recipe, &run.trainer().clock).sh_degree;
     assert_eq!(
         shown, 3,
         "colours that depend on the direction do so from the first step on"

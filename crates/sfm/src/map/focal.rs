@@ -2,8 +2,7 @@
 
 use super::Unverified;
 use super::types::{GroupCamera, PhotoInfo};
-use super::verify::{Cameras, UncalibratedPair, centered_points, essential_from, select};
-use crate::geometry::camera::DCamera;
+use super::verify::{Cameras, UncalibratedPair, centered_points, essential_from, long_side, select};
 use crate::geometry::correspondences::Correspondences;
 use crate::geometry::essential::{motions, refine_motion};
 use glam::{DMat3, DVec2};
@@ -67,12 +66,9 @@ pub(super) fn cameras(unverified: &Unverified, uncalibrated: &[&UncalibratedPair
         .map(|group| {
             let members: Vec<&PhotoInfo> = photos.iter().filter(|p| p.group == group).collect();
             let Some(first) = members.first() else {
-                return GroupCamera {
-                    camera: DCamera::centered(1, 1, 1.0),
-                    source: FocalSource::Guess,
-                };
+                return GroupCamera::centered(1, 1, 1.0, FocalSource::Guess);
             };
-            let long_side = f64::from(first.width.max(first.height));
+            let long_side = long_side(first);
             let mut priors: Vec<f64> = members.iter().filter_map(|p| p.focal_prior_px).collect();
             priors.sort_by(f64::total_cmp);
             let prior = priors.get(priors.len() / 2).map(|prior| prior / long_side);
@@ -82,11 +78,7 @@ pub(super) fn cameras(unverified: &Unverified, uncalibrated: &[&UncalibratedPair
                 (_, Some(focal)) => (focal, FocalSource::Pairs),
                 (None, None) => (DEFAULT_FOCAL, FocalSource::Guess),
             };
-            let focal = focal * long_side;
-            GroupCamera {
-                camera: DCamera::centered(first.width, first.height, focal),
-                source,
-            }
+            GroupCamera::centered(first.width, first.height, focal * long_side, source)
         })
         .collect()
 }
@@ -181,7 +173,7 @@ impl VotingPair {
             matrix: uncalibrated.matrix,
             points: points.into_iter().step_by(step).collect(),
             // A quarter of the threshold: the remaining errors are those of the model, not wrong matches.
-            threshold: 0.25 * options.max_epipolar_error / f64::from(first.width.max(first.height)),
+            threshold: 0.25 * options.max_epipolar_error / long_side(first),
         }
     }
 

@@ -15,7 +15,7 @@ use glam::{DVec2, DVec3};
 /// Maximum number of seeds tried for one model, and of candidates from which they are selected.
 const MAX_SEEDS: usize = 12;
 const MAX_SEED_CANDIDATES: usize = 20 * MAX_SEEDS;
-/// Minimum fraction of its photographs' observations that a doubtful model must explain, such as one whose focal lengths are open.
+/// Minimum fraction of its photographs' observations that a doubtful model must explain, such as one whose focal lengths are guessed.
 /// Correct models of six captures, each cropped in ten ways, explain 0.88 to 1.00, and of a clock with three models 0.74; wrong ones
 /// 0.06 to 0.67.
 const MIN_EXPLAINED_FRACTION: f64 = 0.8;
@@ -35,11 +35,12 @@ const FOCAL_FACTORS: [f64; 17] = [
 /// Maximum number of rounds of adjustment, filtering and triangulation at the end.
 const MAX_FINAL_ROUNDS: usize = 3;
 
-/// The largest model over several seeds among photographs not yet taken, from `pairs` and their `tracks`; `None` if there is none.
+/// The largest model over several seeds among photographs that are not `assigned` to a model yet, from `pairs` and their `tracks`; `None`
+/// if there is none.
 ///
 /// The search ends with a seed whose model has more than half of the photographs it could reach. Two photographs with wrong focal lengths
 /// may lead to a wrong model of all photographs, which explains a third of their observations instead of nine tenths: where focal lengths
-/// are open, or end far from where they began, the model must explain most observations as well. So must a model of few photographs: a
+/// are guessed, or end far from where they began, the model must explain most observations as well. So must a model of few photographs: a
 /// seed with wrong poses hardly finds others that disagree. The failures of the best seed are added to `failed_registrations`.
 pub(super) fn grow_model<'a>(
     input: &Input<'a>,

@@ -4,12 +4,11 @@
 //! are wrong. A point on which three photographs agree is correct; a point of two photographs is accepted if points beside it, in both
 //! photographs, have a similar depth.
 
-use super::focal::FocalSource;
 use super::model::GrowingModel;
 use super::tracks::Tracks;
-use super::types::{GroupCamera, KnownGeometry, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, VerifiedPair};
-use super::verify::inverse_calibration;
-use super::{finish, verify};
+use super::types::{KnownGeometry, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, VerifiedPair};
+use super::verify::{inverse_calibration, long_side};
+use super::{exact_camera, finish, verify};
 use crate::geometry::camera::DCamera;
 use crate::geometry::essential::Motion;
 use crate::geometry::pose::DPose;
@@ -51,10 +50,7 @@ pub fn add_guided_points(
     let guided = guided_pairs(photos, features, model);
     let tracks = Tracks::complete(features, &[&guided, pairs].concat());
     // Groups without a camera have no photograph in the model.
-    let camera = |camera: &Option<DCamera>| GroupCamera {
-        camera: camera.unwrap_or(DCamera::centered(1, 1, 1.0)),
-        source: FocalSource::Prior,
-    };
+    let camera = |camera: &Option<DCamera>| exact_camera(camera.unwrap_or(DCamera::centered(1, 1, 1.0)));
     let cameras: verify::Cameras = model.cameras.iter().map(camera).collect();
     let mut growing = GrowingModel::new(photos, &cameras, &tracks, options);
     growing.hold(&KnownGeometry::from(&*model));
@@ -208,7 +204,7 @@ fn has_consistent_depth(
         let Some((at, depth)) = position_and_depth(point, *observation, features, model) else {
             return false;
         };
-        let radius = NEIGHBOUR_RADIUS * f64::from(photo.width.max(photo.height));
+        let radius = NEIGHBOUR_RADIUS * long_side(photo);
         let mut neighbours: Vec<(f64, f64)> = depths[observation.0 as usize]
             .iter()
             .map(|(other, depth)| (other.distance_squared(at), *depth))

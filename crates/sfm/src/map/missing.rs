@@ -2,7 +2,7 @@
 //!
 //! Photographs taken from nearly the same place in the same direction share points. Where two share none, their poses cannot both be
 //! right: either parts that look alike, such as corridors on two floors, were mistaken for one, or an object was turned over between the
-//! photographs while its surroundings, such as a scale bar, were not. All existing matches agree with such a model; only the absent ones
+//! photographs while its surroundings, such as a scale bar, were not. All existing matches agree with such a model; only the missing ones
 //! reveal it. After Zach, Irschara and Bischof, "What can missing correspondences tell us about 3D structure and motion?" (CVPR 2008).
 
 use super::types::{MissingMatches, Model, PhotoInfo};

@@ -160,10 +160,8 @@ fn with_guessed_focal(photos: &[PhotoInfo], cameras: &Cameras, focal: f64) -> Op
     }
     let camera = |GroupCamera { camera, .. }: &GroupCamera| {
         let focal = focal * camera.long_side();
-        Some(GroupCamera {
-            camera: DCamera::centered(camera.width, camera.height, focal),
-            source: FocalSource::Guess,
-        })
+        let (width, height) = (camera.width, camera.height);
+        Some(GroupCamera::centered(width, height, focal, FocalSource::Guess))
     };
     Some(cameras.iter().map(camera).collect())
 }

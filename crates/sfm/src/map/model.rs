@@ -104,7 +104,7 @@ impl<'a> GrowingModel<'a> {
         self.adopt_poses(&known.poses);
     }
 
-    /// Adopts the poses and cameras of a finished model, to settle it once more.
+    /// Adopts the poses and cameras of a finished model, to refine it once more.
     pub fn resume(&mut self, model: &Model) {
         for (camera, found) in self.cameras.iter_mut().zip(&model.cameras) {
             *camera = found.unwrap_or(*camera);

@@ -4,7 +4,7 @@
 //! finished model is therefore adjusted twice on some of its observations: with tangential coefficients, and with free principal points
 //! instead. For sixteen unmodified captures, the cost falls by at most 1.5 % (reflex and ray-traced cameras 0.1 %; phones, whose
 //! principal points are up to 1 % of the long side away, 1 %), for squares cropped from upright photographs by 6 %, for a film by a drone
-//! by 9 %, and for photographs cropped on purpose by 6 to 64 %. Where it falls enough, the model is settled once more with free principal
+//! by 9 %, and for photographs cropped on purpose by 6 to 64 %. Where it falls enough, the model is refined once more with free principal
 //! points. Otherwise they stay where they are: fox's would come within 3 px of the published ones, but the splats of three phones gain
 //! only 0.05 dB on average, and the principal points of small photographs and narrow views are not determined (1 and 0.5 %, 20 px wrong).
 //! Leaving them free from the start is worse where photographs were cropped around the centre.
@@ -79,10 +79,5 @@ fn cost_reduction(photos: &[PhotoInfo], features: &[Features], model: &Model, op
         }
     }
     let free = problem.solve(&readjust::OPTIONS);
-    let cost_reduction = 1.0 - free.final_cost / held.final_cost;
-    if cost_reduction.is_finite() {
-        cost_reduction
-    } else {
-        0.0
-    }
+    readjust::cost_reduction(held.final_cost, free.final_cost)
 }

@@ -7,6 +7,12 @@ use crate::adjust::{AdjustOptions, AdjustedCamera, Loss, Observation, Problem, V
 /// Number of observations of each photograph, from long tracks, that are adjusted.
 const MIN_PHOTO_OBSERVATIONS: usize = 200;
 
+/// The fraction by which the cost falls; 0 where that is not defined.
+pub(super) fn cost_reduction(before: f64, after: f64) -> f64 {
+    let fraction = 1.0 - after / before;
+    if fraction.is_finite() { fraction } else { 0.0 }
+}
+
 /// The photographs of `model` with a pose.
 pub(super) fn posed(model: &Model) -> impl Iterator<Item = usize> {
     (0..model.poses.len()).filter(|photo| model.poses[*photo].is_some())

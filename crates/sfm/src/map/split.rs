@@ -1,4 +1,4 @@
-//! Separate mapping of the parts of a scene that were mistaken for one another, which absent matches reveal.
+//! Separate mapping of the parts of a scene that were mistaken for one another, which missing matches reveal.
 //!
 //! Photographs of one part are connected by their strongest pairs, while parts that look alike are connected by weaker ones. Parts are
 //! therefore grown starting with the strongest pairs, and two parts are not joined if many pairs between them should share points and do

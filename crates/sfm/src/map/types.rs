@@ -43,6 +43,16 @@ pub struct GroupCamera {
     pub source: FocalSource,
 }
 
+impl GroupCamera {
+    /// The camera of `width` x `height` pixels with a focal length of `focal` pixels and its principal point at the centre.
+    pub(super) fn centered(width: u32, height: u32, focal: f64, source: FocalSource) -> Self {
+        Self {
+            camera: DCamera::centered(width, height, focal),
+            source,
+        }
+    }
+}
+
 /// How a photograph is mounted on a rig: all photographs of a rig are taken from one position.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RigMount {
@@ -248,9 +258,7 @@ impl Reconstruction {
             let groups = photos.iter_mut().enumerate();
             groups.for_each(|(group, photo)| photo.group = group);
         }
-        for zoom in &self.zooms {
-            zoom.photos.iter().for_each(|photo| photos[*photo].group = zoom.group);
-        }
+        self.zooms.iter().for_each(|zoom| zoom.regroup(photos));
     }
 }
 
@@ -274,6 +282,13 @@ pub struct Zoom {
     pub photos: Vec<usize>,
     /// Focal lengths of both groups, px.
     pub focals: [f64; 2],
+}
+
+impl Zoom {
+    /// Moves its photographs to their group.
+    pub(super) fn regroup(&self, photos: &mut [PhotoInfo]) {
+        self.photos.iter().for_each(|photo| photos[*photo].group = self.group);
+    }
 }
 
 /// Cameras, poses and points in one world: that of the known poses, if there were any; otherwise +Z is up, the origin is near the centre

@@ -120,7 +120,8 @@ fn pixel(features: &Features, keypoint: u32) -> DVec2 {
     features.keypoints[keypoint as usize].at()
 }
 
-fn long_side(photo: &PhotoInfo) -> f64 {
+/// The longer side of a photograph, px.
+pub(super) fn long_side(photo: &PhotoInfo) -> f64 {
     f64::from(photo.width.max(photo.height))
 }
 

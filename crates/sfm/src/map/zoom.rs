@@ -55,8 +55,9 @@ pub(super) fn split_cameras(
     mut found: Reconstruction,
     progress: &mut dyn FnMut(Progress),
 ) -> Reconstruction {
-    let mut grouped = input.photos.to_vec();
     while found.zooms.len() < MAX_ZOOMS {
+        let mut grouped = input.photos.to_vec();
+        found.regroup(&mut grouped);
         let largest = found.models.first();
         let distribution = largest.map(|model| focal_distribution(&grouped, input.features, model));
         let clustered = match distribution {
@@ -69,21 +70,16 @@ pub(super) fn split_cameras(
         let Some(zoom) = clustered.or_else(|| between_models(&grouped, &found.models)) else {
             break;
         };
-        let mut regrouped = grouped.clone();
-        zoom.photos
-            .iter()
-            .for_each(|photo| regrouped[*photo].group = zoom.group);
+        zoom.regroup(&mut grouped);
         let mut cameras: Vec<_> = found.cameras.iter().copied().map(Some).collect();
         let lens = found.cameras[zoom.previous_group].camera;
         cameras.push(None);
         for (group, focal) in [zoom.previous_group, zoom.group].into_iter().zip(zoom.focals) {
-            cameras[group] = Some(GroupCamera {
-                camera: DCamera::centered(lens.width, lens.height, focal),
-                source: FocalSource::Pairs,
-            });
+            let camera = GroupCamera::centered(lens.width, lens.height, focal, FocalSource::Pairs);
+            cameras[group] = Some(camera);
         }
         let input = Unverified {
-            photos: &regrouped,
+            photos: &grouped,
             ..*input
         };
         let again = map_with_cameras(&input, &cameras, progress);
@@ -92,7 +88,6 @@ pub(super) fn split_cameras(
         }
         let zooms = [std::mem::take(&mut found.zooms), vec![zoom]].concat();
         found = Reconstruction { zooms, ..again };
-        grouped = regrouped;
     }
     found
 }
@@ -107,10 +102,12 @@ fn with_own_focals(
     let shared = found.models.first()?;
     let shared_camera = |photo: &PhotoInfo| {
         let focal = shared.cameras[photo.group].as_ref()?.focal();
-        Some(GroupCamera {
-            camera: DCamera::centered(photo.width, photo.height, focal),
-            source: FocalSource::Guess,
-        })
+        Some(GroupCamera::centered(
+            photo.width,
+            photo.height,
+            focal,
+            FocalSource::Guess,
+        ))
     };
     let cameras: Vec<_> = input.photos.iter().map(shared_camera).collect();
     let each = input.photos.iter().cloned().enumerate();
@@ -285,15 +282,8 @@ fn own_focals(photos: &[PhotoInfo], features: &[Features], model: &Model) -> (Ve
         let camera = problem.cameras.get(*number);
         camera.map_or(f64::NAN, |camera| camera.camera.focal())
     };
-    let cost_reduction = 1.0 - report.final_cost / report.initial_cost;
-    (
-        number.iter().map(focal).collect(),
-        if cost_reduction.is_finite() {
-            cost_reduction
-        } else {
-            0.0
-        },
-    )
+    let cost_reduction = readjust::cost_reduction(report.initial_cost, report.final_cost);
+    (number.iter().map(focal).collect(), cost_reduction)
 }
 
 /// A photograph's own camera, whose focal length is free.

@@ -345,9 +345,9 @@ documented! {
             /// Mean absolute difference of colours in \[0, 1\].
             tau: f64,
         },
-        /// S falls below `ratio` times its value when the stage had seen every view once: a tau without tuning.
+        /// S falls below `ratio` times its value when the stage had seen every view once at the present size: a tau without tuning.
         Relative {
-            /// Fraction of the stage's first S.
+            /// Fraction of the first S in the stage at the present image size.
             ratio: f64,
         },
         /// S has not fallen by the fraction `drop` within `window` recipe steps.
@@ -477,6 +477,27 @@ impl Recipe {
     pub fn unset(&mut self, param: Param) {
         let params = std::iter::once(&mut self.params).chain(self.stage.iter_mut().map(|stage| &mut stage.params));
         params.for_each(|params| drop(params.remove(&param)));
+    }
+
+    /// Puts SH bands up to `degree` in use from the first step on.
+    pub(crate) fn keep_sh_bands(&mut self, degree: u32) {
+        let param = Param::ShDegree;
+        if let (false, Some(first)) = (self.params.contains_key(&param), self.stage.first_mut()) {
+            // Not over the whole run, since that would replace what later stages carry over.
+            let default = Knob::Const(param.row().default);
+            first.params.entry(param).or_insert(default);
+        }
+        let conditional = [
+            &mut self.known_space,
+            &mut self.cut_out,
+            &mut self.skies,
+            &mut self.large,
+        ];
+        let stages = self.stage.iter_mut().map(|stage| &mut stage.params);
+        let tables = std::iter::once(&mut self.params).chain(conditional).chain(stages);
+        for knob in tables.filter_map(|params| params.get_mut(&param)) {
+            knob.raise_to(f64::from(degree));
+        }
     }
 
     /// Recipe steps of all stages.

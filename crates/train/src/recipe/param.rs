@@ -112,6 +112,20 @@ pub enum Knob {
     },
 }
 
+impl Knob {
+    /// Raises values below `min` to it.
+    pub(super) fn raise_to(&mut self, min: f64) {
+        match self {
+            Self::Const(value) => *value = value.max(min),
+            Self::Ramp { from, to, .. } => {
+                *from = from.map(|from| from.max(min));
+                *to = to.max(min);
+            }
+            Self::Steps { steps } => steps.iter_mut().for_each(|(_, value)| *value = value.max(min)),
+        }
+    }
+}
+
 /// Interpolation of a ramp.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, Default)]
 #[serde(rename_all = "snake_case")]

@@ -2,7 +2,7 @@
 
 use crate::recipe::Exit;
 
-/// A running estimate of S since the start of the stage.
+/// A running estimate of S since the start of the stage, or since its images last grew (`MAX_GROWTH`).
 #[derive(Clone, Copy, Debug, PartialEq, Default)]
 pub struct ConvergenceMonitor {
     /// The estimate.

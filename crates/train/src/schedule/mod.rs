@@ -171,15 +171,15 @@ impl Clock {
 
     /// Advances by one step that took `pace` recipe steps; true if a stage ended.
     pub fn tick(&mut self, recipe: &Recipe, pace: f64, metrics: StepMetrics) -> bool {
-        let before = values(recipe, self);
-        self.was_reset |= plan(recipe, self).reset_opacity.is_some();
+        let plan = plan(recipe, self);
+        self.was_reset |= plan.reset_opacity.is_some();
         self.step += 1;
         self.time += pace;
         self.progress += pace * self.stretch;
         let in_stage = self.time - self.stage_time;
         self.monitor
             .observe(metrics.error, metrics.measured, metrics.views, in_stage);
-        let growth = values(recipe, self)[Param::ImageScale] / before[Param::ImageScale];
+        let growth = values(recipe, self)[Param::ImageScale] / plan.values[Param::ImageScale];
         if growth.max(1.0 / growth) > MAX_GROWTH {
             // Errors of images of different sizes cannot be compared: larger ones have more detail, and a larger error.
             self.monitor = ConvergenceMonitor::default();
@@ -188,7 +188,7 @@ impl Clock {
         if exit.is_some_and(|exit| self.monitor.should_end(exit, metrics.views, in_stage)) {
             self.leave_early(recipe);
         }
-        self.enter_stages(recipe, before)
+        self.enter_stages(recipe, plan.values)
     }
 
     /// Advances `time` without a step.

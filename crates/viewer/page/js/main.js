@@ -6,7 +6,6 @@ import "./toolbar.js";
 import "./sidebar.js";
 import "./timeline.js";
 import "./help.js";
-import "./commands.js";
 import "./edit/placement.js";
 import { stage } from "./commands.js";
 import { connection } from "./connection.js";

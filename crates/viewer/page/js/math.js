@@ -29,6 +29,9 @@ export const multiply = ([aw, ax, ay, az], [bw, bx, by, bz]) => [
 ];
 
 /** @param {Quat} q @returns {Quat} */
+export const conjugate = ([w, x, y, z]) => [w, -x, -y, -z];
+
+/** @param {Quat} q @returns {Quat} */
 export const unit = (q) => {
   const n = Math.hypot(...q) || 1;
   return [q[0] / n, q[1] / n, q[2] / n, q[3] / n];

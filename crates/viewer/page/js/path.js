@@ -3,7 +3,7 @@
 // Positions and fields of view follow a Catmull-Rom spline through the keys with tangents from the times of the neighbours;
 // rotations are interpolated by squad (Shoemake 1987): slerp of slerps with inner quaternions.
 
-import { clamp, multiply, slerp, unit } from "./math.js";
+import { clamp, conjugate, multiply, slerp, unit } from "./math.js";
 import { REST, between, placedCamera } from "./similarity.js";
 import { state } from "./state.js";
 
@@ -14,9 +14,6 @@ import { state } from "./state.js";
 
 /** Initial time between key frames, seconds. */
 export const KEY_INTERVAL = 2;
-
-/** @param {Quat} q @returns {Quat} */
-const conjugate = ([w, x, y, z]) => [w, -x, -y, -z];
 
 /** Logarithm of a unit quaternion: axis times half the angle. @param {Quat} q @returns {Vec3} */
 function log([w, x, y, z]) {

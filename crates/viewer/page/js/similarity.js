@@ -1,6 +1,6 @@
 // Similarities between coordinate systems, for scenes that are moved as a whole and everything in them.
 
-import { add, length, multiply, rotate, scale, subtract, unit } from "./math.js";
+import { add, conjugate, length, multiply, rotate, scale, subtract, unit } from "./math.js";
 
 /** @typedef {import("./math.js").Vec3} Vec3 */
 /** @typedef {import("./math.js").Quat} Quat */
@@ -17,8 +17,7 @@ export const placedCamera = (by, camera) => ({ ...camera, position: placed(by, c
 
 /** The inverse of `from`, then `to`. @param {Similarity} from @param {Similarity} to @returns {Similarity} */
 export function between(from, to) {
-  const [w, x, y, z] = from.rotation;
-  const rotation = unit(multiply(to.rotation, [w, -x, -y, -z]));
+  const rotation = unit(multiply(to.rotation, conjugate(from.rotation)));
   const factor = to.scale / from.scale;
   return { scale: factor, rotation, translation: subtract(to.translation, scale(rotate(rotation, from.translation), factor)) };
 }

@@ -22,7 +22,7 @@ use save::folder_of;
 pub(crate) use save::stem_of;
 use uploads::Uploads;
 pub(crate) use worker::run_editing;
-pub(crate) use world::{moved_camera, to_world};
+pub(crate) use world::moved_camera;
 
 /// Maximum number of waiting requests.
 const MAX_WAITING: usize = 64;

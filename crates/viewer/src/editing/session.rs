@@ -262,8 +262,8 @@ impl Session {
         };
         for (i, edit) in list.edits.iter().enumerate() {
             if let Operation::Merge { file } = &edit.op {
-                let opened = self.uploads.open(file).map_err(EditError::Source);
-                opened.map_err(|reason| in_list(i, reason))?;
+                let found = self.uploads.check(file).map_err(EditError::Source);
+                found.map_err(|reason| in_list(i, reason))?;
             }
         }
         for (i, edit) in list.edits.iter().enumerate() {

@@ -92,11 +92,28 @@ impl Uploads {
             return Ok(upload.cloud.clone());
         }
         drop(files);
+        read_splats(&self.sibling(name)?).map_err(|error| error.to_string())
+    }
+
+    /// Whether [`Self::open`] finds a scene.
+    ///
+    /// # Errors
+    /// When there is none.
+    pub fn check(&self, name: &str) -> Result<(), String> {
+        let files = self.files.lock().unwrap_or_else(PoisonError::into_inner);
+        if files.contains_key(name) {
+            return Ok(());
+        }
+        self.sibling(name).map(drop)
+    }
+
+    /// The file `name` beside the edited scene.
+    fn sibling(&self, name: &str) -> Result<PathBuf, String> {
         let path = self.folder.join(name);
         if name.contains(['/', '\\', ':']) || !path.is_file() {
             return Err(format!("no scene {name} has been sent: choose it with Merge first"));
         }
-        read_splats(&path).map_err(|error| error.to_string())
+        Ok(path)
     }
 
     /// Writes the file `name` to the folder, where `irradia edit` finds it.

@@ -38,15 +38,6 @@ pub(crate) fn operation_to_dataset(op: &mut Operation, world: &Similarity) {
     }
 }
 
-/// From the dataset's coordinates to `world`.
-pub(crate) fn to_world(world: &Similarity) -> Transform {
-    Transform {
-        scale: world.scale,
-        rotation: DQuat::IDENTITY,
-        translation: world.apply(DVec3::ZERO),
-    }
-}
-
 /// The transform of the scene from the world `from` to the world `to`, after it was moved by `moved` in the dataset's coordinates.
 pub(crate) fn placement(from: &Similarity, moved: &Transform, to: &Similarity) -> Transform {
     // to (k R (x / s + c) + t - c')
@@ -103,7 +94,7 @@ mod tests {
         let point = DVec3::new(0.3, -0.2, 0.1);
         let expected = to.apply(moved.apply(DISTANT_WORLD.invert(point)));
         assert!((by.apply(point) - expected).length() < 1e-6 * expected.length());
-        let there = to_world(&DISTANT_WORLD).apply(DISTANT_WORLD.invert(point));
+        let there = Transform::to_world(&DISTANT_WORLD).apply(DISTANT_WORLD.invert(point));
         assert!((there - point).length() < 1e-6);
     }
 }

@@ -22,14 +22,15 @@ class ViewsPanel extends HTMLElement {
     this.summary = el("p", { className: "note" });
     this.body = el("div", { className: "views" });
     this.append(section("Views", el("div", { className: "row wrap" }, measure, order), this.summary, this.body));
-    state.watch(["views"], () => {
+    state.addEventListener("scores", () => this.list());
+    state.addEventListener("view", () => this.mark());
+    // Not with the views, which move with the scene: their names and photographs are those of the greeting.
+    state.watch(["hello"], () => {
+      measure.disabled = !state.get("views").some((view) => view.photo);
       this.entries = state.get("views").map((view, index) => entry(view, index));
       this.list();
       this.mark();
     });
-    state.addEventListener("scores", () => this.list());
-    state.addEventListener("view", () => this.mark());
-    state.watch(["hello"], () => (measure.disabled = !state.get("views").some((view) => view.photo)));
   }
 
   /** Shows scores and order. The entries stay, and with them the focus and how far the list is scrolled. */

@@ -1,6 +1,5 @@
 //! The socket of one page: passes its requests to the scheduler, and sends it pictures and news.
 
-use crate::Subject;
 use crate::live::ReportCursor;
 use crate::message::Request;
 use crate::scheduler::{MAX_CLIENTS, OutMessage, Task};
@@ -247,7 +246,7 @@ fn handle(shared: &Shared, client: u64, message: Message, limiter: &mut RateLimi
         }
         Request::Unit { metres } => {
             let folder = subject.folder.as_ref();
-            let kept = folder.map(|folder| folder.set_metres_per_unit(metres * edit_scale(subject)));
+            let kept = folder.map(|folder| folder.set_metres_per_unit(metres));
             let reply = match kept {
                 Some(Ok(())) => json!({ "tell": "unit", "metres": metres }),
                 Some(Err(error)) => json!({ "tell": "problem", "text": error.to_string() }),
@@ -257,11 +256,6 @@ fn handle(shared: &Shared, client: u64, message: Message, limiter: &mut RateLimi
         }
     }
     Outcome::Continue
-}
-
-/// The factor by which edits have scaled the whole scene: the unit saved in the run is that before the edits.
-fn edit_scale(subject: &Subject) -> f64 {
-    subject.edition().map_or(1.0, |edition| edition.placement.scale)
 }
 
 /// The first message to a page.
@@ -277,7 +271,7 @@ fn hello(shared: &Shared) -> Value {
         "plan": subject.live.as_ref().map(|live| live.plan()),
         "recipe": subject.recipe,
         "id": shared.id,
-        "metres": subject.folder.as_ref().and_then(|folder| folder.metres_per_unit()).map(|metres| metres / edit_scale(subject)),
+        "metres": subject.folder.as_ref().and_then(|folder| folder.metres_per_unit()),
         "keeps_unit": subject.folder.is_some(),
         "warnings": subject.warnings,
         "editing": { "works": subject.editing.is_ok(), "why": subject.editing.as_ref().err() },

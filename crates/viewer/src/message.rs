@@ -174,7 +174,7 @@ pub enum Request {
     },
     /// Keep the length of the world's unit in the run.
     Unit {
-        /// Metres per world unit.
+        /// Metres per world unit of the scene as it was opened.
         metres: f64,
     },
     /// Edit the scene.

@@ -62,6 +62,7 @@ const FILES: &[(&str, &str, &str)] = files![
     SCRIPT "js/state.js",
     SCRIPT "js/timeline.js",
     SCRIPT "js/toolbar.js",
+    SCRIPT "js/units.js",
     SCRIPT "js/xr.js",
     TEXT "shaders/present.wgsl",
     TEXT "shaders/project.frag",

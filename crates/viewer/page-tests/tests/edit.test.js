@@ -319,6 +319,50 @@ test("a saved camera path and the side seen first are those of the scene, howeve
   await server.stop();
 });
 
+test("metres stay the same when the scene is scaled, on a page that was not connected, too", async () => {
+  const scene = copy("measured");
+  const unit = join(scene, "unit.json");
+  writeFileSync(unit, JSON.stringify({ metres_per_unit: 0.5 }));
+  const server = await serve("view", scene, "--port", "0");
+  const size = { width: 900, height: 700 };
+  const [{ page, problems }, other] = [await open(browser, server.address, size), await open(browser, server.address, size)];
+  const shown = (page) => page.evaluate(async () => {
+    const [{ length, subtract }, { state }, { distanceText }] = await Promise.all(["math", "state", "units"].map((name) => import(`/page/js/${name}.js`)));
+    const [a, b] = state.get("measured");
+    return distanceText(length(subtract(a, b)));
+  });
+  for (const one of [page, other.page]) {
+    await set(one, { drawing: "served", measured: [[0, 0, 0], [1, 0, 0]] });
+    assert.equal(await shown(one), "50.00 cm");
+  }
+  await other.page.evaluate(async () => {
+    const { connection } = await import("/page/js/connection.js");
+    // It does not reconnect by itself.
+    connection.wait = 1e9;
+    connection.socket.close();
+  });
+  await until(other.page, async () => (await import("/page/js/state.js")).state.get("connection") === "lost");
+  await page.evaluate(async () => (await import("/page/js/edit/session.js")).session.edit({ op: "scale", factor: 2 }, true));
+  await edited(page, (e) => e.at === 1);
+  assert.equal(await shown(page), "50.00 cm");
+  await other.page.evaluate(async () => (await import("/page/js/connection.js")).connection.open());
+  await until(other.page, async () => (await import("/page/js/state.js")).state.get("scene").placement.scale > 1.5);
+  assert.equal(await shown(other.page), "50.00 cm");
+
+  // What was one unit when the scene was opened is set to 2 m.
+  await set(page, { sidebar: true, tab: "display" });
+  await page.getByLabel("True length in metres").fill("2");
+  await page.getByRole("button", { name: "Set scale" }).click();
+  await until(page, async () => (await import("/page/js/state.js")).state.get("metres") !== 0.5);
+  assert.ok(Math.abs(JSON.parse(readFileSync(unit, "utf8")).metres_per_unit - 2) < 1e-6);
+  assert.equal(await shown(page), "2.000 m");
+  await page.evaluate(async () => (await import("/page/js/edit/session.js")).session.undo());
+  await edited(page, (e) => e.at === 0);
+  assert.equal(await shown(page), "2.000 m");
+  assert.deepEqual([...problems, ...other.problems], []);
+  await server.stop();
+});
+
 // WebGPU in software is slow: a small picture, wide enough for the bar of tools.
 for (const [api, size, before] of /** @type {const} */ ([["WebGL2", { width: 800, height: 560 }], ["WebGPU", { width: 800, height: 420 }, pretendGpu]])) test(`a page that draws itself with ${api} shows the selection and the edit`, async () => {
   const local = await browse(api === "WebGPU" ? "webgpu" : "webgl");

@@ -67,7 +67,8 @@ class Connection extends EventTarget {
       case "hello":
         // Another server at the same address may have another scene.
         if ((state.get("hello")?.id ?? told.id) !== told.id) return location.reload();
-        state.set({ hello: told, views: told.views, metres: told.metres, ...(told.scene && { scene: told.scene }) });
+        // A scale that the server cannot keep stays.
+        state.set({ hello: told, views: told.views, metres: told.metres ?? state.get("metres"), ...(told.scene && { scene: told.scene }) });
         break;
       case "scene":
         state.set({ scene: told });

@@ -1,10 +1,11 @@
 // Small things on the stage: status, legend, axes, comparison, hints.
 
-import { AXIS_COLORS, distanceText, world } from "./overlay.js";
+import { AXIS_COLORS } from "./overlay.js";
 import { axes, length, subtract } from "./math.js";
 import { MODES, stage } from "./commands.js";
 import { choose, el, segments, short } from "./dom.js";
 import { state } from "./state.js";
+import { distanceText, metresPerUnit, world } from "./units.js";
 
 /** @typedef {import("./math.js").Vec3} Vec3 */
 
@@ -49,7 +50,7 @@ class Hud extends HTMLElement {
       lost.hidden = connection === "open" || connection === "connecting";
       lost.textContent = connection === "full" ? "Too many pages are open: waiting until one is closed" : "Connection lost: reconnecting";
     });
-    state.watch(["tool", "measured", "metres"], () => {
+    state.watch(["tool", "measured", "metres", "scene"], () => {
       const [a, b] = state.get("measured");
       const hints = /** @type {Record<string, string>} */ ({ inspect: "Click a splat; Escape to stop", measure: "Click two points on surfaces; Escape to stop" });
       const text = hints[state.get("tool")] ?? "";
@@ -96,7 +97,7 @@ function legendOf(header) {
   const mode = error ? "error" : state.get("mode");
   const name = error ? "Mean error" : (MODES.find(([value]) => value === mode)?.[1] ?? "");
   const [low, high] = header.range;
-  const metres = mode === "depth" ? state.get("metres") : null;
+  const metres = mode === "depth" ? metresPerUnit() : null;
   const text = (/** @type {number} */ value) => short(metres ? value * metres : Number((mode === "depth" ? value / world().scale : value).toPrecision(3)));
   const ramp = el("div", { className: "ramp" });
   ramp.style.background = error ? RAMPS.heat : mode === "alpha" ? RAMPS.grey : RAMPS.even;

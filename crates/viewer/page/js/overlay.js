@@ -5,6 +5,7 @@ import { add, axes, cross, length, scale, subtract } from "./math.js";
 import { pictureOf } from "./connection.js";
 import { path } from "./path.js";
 import { state } from "./state.js";
+import { distanceText } from "./units.js";
 
 /** @typedef {import("./camera.js").Camera} Camera */
 /** @typedef {import("./camera.js").Intrinsics} Intrinsics */
@@ -166,17 +167,6 @@ function drawMeasured(draw, pixel) {
   context.shadowBlur = 4 * pixel;
   context.fillText(distanceText(length(subtract(points[0], points[1]))), at[0], at[1] - 8 * pixel);
   context.shadowBlur = 0;
-}
-
-/** From the dataset's coordinates to the scene's, which are centred and scaled. @returns {{ scale: number, center: Vec3 }} */
-export const world = () => state.get("scene")?.world ?? { scale: 1, center: [0, 0, 0] };
-
-/** A distance in metres, or in units of the dataset. @param {number} units of the scene */
-export function distanceText(units) {
-  const metres = state.get("metres");
-  if (!metres) return `${(units / world().scale).toPrecision(4)} units`;
-  const value = units * metres;
-  return value < 1 ? `${(100 * value).toPrecision(4)} cm` : `${value.toPrecision(4)} m`;
 }
 
 /** @param {Draw} draw @param {number} pixel */

@@ -41,7 +41,7 @@
  * @property {{ color: Vec3, mode: import("./edit/session.js").Mode } | null} dropped the colour under the eyedropper
  * @property {import("./edit/session.js").Editing | null} editing
  * @property {Vec3[]} measured
- * @property {number | null} metres per world unit
+ * @property {number | null} metres per world unit of the scene as it was opened; `units.js` converts lengths
  * @property {object | null} picked
  * @property {any} train
  * @property {any} hello

@@ -3,6 +3,7 @@
 
 import { axes, fromAxes } from "./math.js";
 import { state } from "./state.js";
+import { metresPerUnit } from "./units.js";
 
 /** The parts of WebXR that are used. @typedef {any} Xr */
 
@@ -33,7 +34,7 @@ export async function enterXr(stage) {
     const space = await session.requestReferenceSpace("local");
     const start = state.get("camera");
     // If the scale is unknown, one metre is a sixth of the scene's radius.
-    const metre = 1 / (state.get("metres") ?? 6 / (state.get("scene")?.radius ?? 6));
+    const metre = 1 / (metresPerUnit() ?? 6 / (state.get("scene")?.radius ?? 6));
     const frame = (/** @type {number} */ _now, /** @type {Xr} */ now) => {
       session.requestAnimationFrame(frame);
       const pose = now.getViewerPose(space);

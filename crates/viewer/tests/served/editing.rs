@@ -282,3 +282,23 @@ fn a_scene_that_is_turned_is_seen_from_the_same_side_and_keeps_its_paths() {
     let again = Served::of(&folder.join("scene.edited.ply"), "127.0.0.1");
     turned(&next_message(&mut again.socket(), "hello")["scene"]);
 }
+
+#[test]
+fn metres_are_those_per_unit_of_the_scene_as_it_was_opened_however_edits_scale_it() {
+    let served = serve("127.0.0.1");
+    let folder = served.scene().parent().expect("a folder");
+    // A folder with this file is that of a run, which keeps the unit.
+    fs::write(folder.join("run.json"), "{}").expect("written");
+    fs::write(folder.join("unit.json"), r#"{ "metres_per_unit": 2 }"#).expect("written");
+    let opened = Served::of(served.scene(), "127.0.0.1");
+    let mut first = page(&opened);
+    let enlarge = json!({ "op": "scale", "factor": 4 });
+    send_request(&mut first, &json!({ "do": "edit", "whole": true, "edit": enlarge }));
+    assert_eq!(next_message(&mut first, "scene")["placement"]["scale"], json!(4.0));
+    let hello = next_message(&mut opened.socket(), "hello");
+    assert_eq!(hello["scene"]["placement"]["scale"], json!(4.0));
+    assert_eq!(hello["metres"], json!(2.0));
+    send_request(&mut first, &json!({ "do": "unit", "metres": 3 }));
+    assert_eq!(next_message(&mut first, "unit")["metres"], json!(3.0));
+    assert_eq!(next_message(&mut opened.socket(), "hello")["metres"], json!(3.0));
+}

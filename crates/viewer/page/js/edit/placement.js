@@ -36,13 +36,12 @@ function placeViews() {
 
 /** Moves the camera with the scene, so that the picture stays the same. @param {Similarity} by */
 function follow(by) {
-  const { camera, pivot, up, measured, metres, region, view } = state.values;
+  const { camera, pivot, up, measured, region, view } = state.values;
   state.set({
     camera: placedCamera(by, camera),
     pivot: placed(by, pivot),
     up: rotate(by.rotation, up),
     measured: measured.map((point) => placed(by, point)),
-    metres: metres && metres / by.scale,
     region: region && { ...region, center: placed(by, region.center), half: scale(region.half, by.scale), rotation: unit(multiply(by.rotation, region.rotation)) },
     clip: null,
     view,

@@ -2,10 +2,10 @@
 
 import { el, facts, row, section, segments, short } from "../dom.js";
 import { connection } from "../connection.js";
-import { distanceText, world } from "../overlay.js";
 import { add, length, lookAt, scale, subtract } from "../math.js";
 import { stage } from "../commands.js";
 import { state } from "../state.js";
+import { distanceText, metresPerUnit, openedMetres, world } from "../units.js";
 
 /** @typedef {import("../math.js").Vec3} Vec3 */
 
@@ -129,19 +129,19 @@ class DisplayPanel extends HTMLElement {
     const known = el("input", { type: "number", min: "0", step: "any", placeholder: "metres", "aria-label": "True length in metres" });
     const set = el("button", { type: "button", textContent: "Set scale", onclick: () => {
       const [a, b] = state.get("measured");
-      const metres = Number(known.value) / length(subtract(a, b));
+      const metres = openedMetres(length(subtract(a, b)), Number(known.value));
       if (!(metres > 0)) return;
       if (state.get("hello")?.keeps_unit) connection.send({ do: "unit", metres });
       else state.set({ metres });
     } });
     const kept = el("p", { className: "note" });
     const truth = row("True length", known, set);
-    state.watch(["tool", "measured", "metres"], () => {
+    state.watch(["tool", "measured", "metres", "scene"], () => {
       const [a, b] = state.get("measured");
       start.setAttribute("aria-pressed", String(state.get("tool") === "measure"));
       result.textContent = a && b ? distanceText(length(subtract(a, b))) : state.get("tool") === "measure" ? "Click two points" : "";
       truth.hidden = !(a && b);
-      const metres = state.get("metres");
+      const metres = metresPerUnit();
       kept.textContent = metres ? `One unit is ${short(metres * world().scale)} m` : "The scale is unknown";
     });
     return section("Measure", el("div", { className: "row" }, start, result), truth, kept);

@@ -2,13 +2,13 @@
 
 import { choose, el, press, row, section, segments } from "../dom.js";
 import { ahead, forward } from "../camera.js";
-import { distanceText } from "../overlay.js";
 import { icon } from "../icons.js";
 import { length, subtract } from "../math.js";
 import { TOOLS, isEditTool } from "../edit/tools.js";
 import { colors, halfSpace } from "../edit/shapes.js";
 import { session } from "../edit/session.js";
 import { state } from "../state.js";
+import { distanceText, openedMetres } from "../units.js";
 
 /** Names of the ways to combine. @type {[import("../edit/session.js").Mode, string, string][]} */
 const MODES = [["replace", "New", "Replaces the selection"], ["add", "Add", "Adds (Shift)"], ["subtract", "Subtract", "Subtracts (Alt)"], ["intersect", "Intersect", "Keeps what is in both (Shift Alt)"]];
@@ -239,7 +239,7 @@ class EditPanel extends HTMLElement {
       const [a, b] = state.get("measured");
       const metres = Number(known.value);
       if (!(metres > 0)) return;
-      state.set({ metres: metres / length(subtract(a, b)) });
+      state.set({ metres: openedMetres(length(subtract(a, b)), metres) });
       session.edit({ op: "set-length", from: a, to: b, length: metres }, true);
     });
     const other = el("input", { type: "file", hidden: true, "aria-label": "Scene to merge" });

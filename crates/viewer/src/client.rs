@@ -271,6 +271,7 @@ fn hello(shared: &Shared) -> Value {
         "plan": subject.live.as_ref().map(|live| live.plan()),
         "recipe": subject.recipe,
         "id": shared.id,
+        "server": shared.server,
         "metres": subject.folder.as_ref().and_then(|folder| folder.metres_per_unit()),
         "keeps_unit": subject.folder.is_some(),
         "warnings": subject.warnings,

@@ -3,7 +3,7 @@
 use crate::compact::compact_in_order;
 use crate::draw::encode;
 use crate::editing::stem_of;
-use crate::guard::{Entry, Guard, TOKEN_NAME, UPLOAD_PATH};
+use crate::guard::{Entry, Guard, TOKEN_NAME, UPLOAD_PATH, random_token};
 use crate::importance::by_importance;
 use crate::message::MAX_REQUEST;
 use crate::notices::Notices;
@@ -51,6 +51,8 @@ const SECURITY_POLICY: &str = "default-src 'self'; img-src 'self' blob: data:; s
 pub(crate) struct Shared {
     /// Identifies the scene and its photographs: what a browser has cached for the same address may belong to another scene.
     pub id: String,
+    /// Identifies this server, at random: versions of the scene and numbers of selections are counted anew after a restart.
+    pub server: String,
     pub subject: Subject,
     pub scheduler: Scheduler,
     pub guard: Guard,
@@ -83,9 +85,12 @@ fn identity(subject: &Subject) -> String {
 }
 
 impl Shared {
-    pub fn new(subject: Subject, guard: Guard, notices: Arc<Notices>) -> Self {
-        Self {
+    /// # Errors
+    /// When the system refuses random numbers.
+    pub fn new(subject: Subject, guard: Guard, notices: Arc<Notices>) -> Result<Self, getrandom::Error> {
+        Ok(Self {
             id: identity(&subject),
+            server: random_token()?,
             subject,
             scheduler: Scheduler::default(),
             guard,
@@ -96,7 +101,7 @@ impl Shared {
             decoding: Semaphore::new(2),
             packing: Semaphore::new(1),
             uploading: Semaphore::new(1),
-        }
+        })
     }
 }
 

@@ -34,13 +34,14 @@ impl Viewer {
     /// When no address can be listened on, or the system refuses threads or random numbers.
     pub fn start(subject: Subject, listen: &Listen, sink: LineSink) -> Result<Self, ViewerError> {
         let refused = |error: io::Error| ViewerError::Start(error.to_string());
+        let not_random = |error: getrandom::Error| ViewerError::Start(error.to_string());
         let notices = Arc::new(Notices::new(sink));
         let listener = listen.bind()?;
         let bound = listener.local_addr().map_err(refused)?;
         let token = if bound.ip().is_loopback() {
             None
         } else {
-            Some(random_token().map_err(|error| ViewerError::Start(error.to_string()))?)
+            Some(random_token().map_err(not_random)?)
         };
         let query = token
             .as_ref()
@@ -53,7 +54,7 @@ impl Viewer {
             host: listen.host.clone(),
             token,
         };
-        let shared = Arc::new(Shared::new(subject, guard, notices.clone()));
+        let shared = Arc::new(Shared::new(subject, guard, notices.clone()).map_err(not_random)?);
         if let Some(live) = &shared.subject.live {
             let weak = Arc::downgrade(&shared);
             let wake = move || {

@@ -206,6 +206,53 @@ test("two pages have a camera each, and come back after the server died", async 
   await again.stop();
 });
 
+test("a page that draws itself keeps its splats while the connection is broken, and loads them again from another server", async () => {
+  const local = await browse("webgl");
+  const server = await serve("view", trained(), "--port", "0");
+  const { page, problems } = await open(local, server.address, { width: 500, height: 400 });
+  await set(page, { drawing: "local", axes: false });
+  await sharp(page);
+  const before = await picture(page);
+  let loads = 0;
+  const isLoad = (request) => new URL(request.url()).pathname === "/splats";
+  page.on("request", (request) => isLoad(request) && (loads += 1));
+  const reconnect = () => page.evaluate(async () => {
+    const [{ connection }, { state }] = await Promise.all(["connection", "state"].map((name) => import(`/page/js/${name}.js`)));
+    const told = new Promise((resolve) => state.addEventListener("editing", resolve, { once: true }));
+    connection.socket.close();
+    // It comes after the greeting.
+    await told;
+  });
+  await reconnect();
+  await sharp(page);
+  assert.ok(psnr(before, await picture(page)) > 60);
+  await set(page, { view: null, camera: { ...(await get(page, "camera")), fov: 0.4 } });
+  await sharp(page);
+  const near = await picture(page);
+  assert.ok(psnr(before, near) < 30, "it still draws");
+  await set(page, { drawing: "served" });
+  await sharp(page);
+  assert.ok(psnr(near, await picture(page)) > 35, "and is still served");
+  await set(page, { drawing: "local" });
+  await page.evaluate(async () => (await import("/page/js/edit/session.js")).session.select([{ shape: "half-space", point: [0, 0, 0], normal: [1, 0, 0] }], "replace"));
+  await until(page, () => document.querySelector("irr-stage").local.masked > 0);
+  const masked = await page.evaluate(() => document.querySelector("irr-stage").local.masked);
+  await reconnect();
+  assert.equal(await page.evaluate(() => document.querySelector("irr-stage").local.masked), masked, "the selection stays");
+  assert.equal(loads, 0, "the splats are those of before");
+  assert.deepEqual(problems, []);
+
+  const again = page.waitForRequest(isLoad);
+  await server.stop("SIGKILL");
+  const other = await serve("view", trained(), "--port", new URL(server.address).port);
+  await again;
+  await until(page, () => document.querySelector("irr-stage").local.masked === 0);
+  await sharp(page);
+  assert.ok(psnr(near, await picture(page)) > 50);
+  await other.stop();
+  await local.close();
+});
+
 test("an address holds the camera", async () => {
   const server = await serve("view", trained(), "--port", "0");
   const { page } = await open(browser, server.address, { width: 500, height: 400 });

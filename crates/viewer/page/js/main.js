@@ -24,8 +24,8 @@ state.watch(["hello"], () => {
   if (hello) document.title = `${hello.title} · Irradia`;
 });
 
-// A restarted server numbers its scenes from the start: the same number may mean other splats. The event of its scene comes after this one.
-state.addEventListener("hello", () => stage().local?.forget());
+// The event of the server's scene comes after this one.
+state.addEventListener("hello", () => stage().local?.connect(state.get("hello").server));
 
 // The first scene determines the first camera; later versions keep it.
 let placed = false;

@@ -86,6 +86,18 @@ fn pages_share_a_session_that_leaves_the_source_alone() {
 }
 
 #[test]
+fn a_page_learns_whether_it_comes_back_to_the_same_server() {
+    let served = serve("127.0.0.1");
+    let hello = |served: &Served| next_message(&mut served.socket(), "hello");
+    let (first, second) = (hello(&served), hello(&served));
+    assert!(first["server"].is_string() && first["server"] == second["server"]);
+    assert_eq!(first["scene"]["version"], second["scene"]["version"]);
+    let other = hello(&Served::of(served.scene(), "127.0.0.1"));
+    assert_eq!(first["id"], other["id"], "the same scene");
+    assert_ne!(first["server"], other["server"]);
+}
+
+#[test]
 fn hostile_requests_are_refused_in_one_line_and_change_nothing() {
     let served = serve("127.0.0.1");
     let mut page = page(&served);

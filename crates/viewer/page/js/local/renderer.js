@@ -44,6 +44,10 @@ export class LocalRenderer {
   /** The level of detail that is drawn; 0 is the scene itself. */
   level = 0;
   version = 0;
+  /** The server that numbers versions and selections. */
+  server = "";
+  /** Whether the splats of `version` are being fetched. */
+  streaming = false;
   /** Whether the splats of `version` have begun to arrive, and when. */
   begun = false;
   beganAt = 0;
@@ -186,8 +190,11 @@ export class LocalRenderer {
     this.scene = scene;
   }
 
-  /** Forgets which version and selection it has, so that the next scene is loaded in any case; shows the old one until then. */
-  forget() {
+  /** Notes which server is connected. Another one numbers versions and selections anew: its scene is loaded in any case, as is one that
+   * was still arriving when the connection broke; the old one is shown until then. @param {string} server */
+  connect(server) {
+    if (server === this.server && !this.streaming) return;
+    this.server = server;
     this.abort?.abort();
     [this.version, this.masked, this.scene] = [0, 0, null];
   }
@@ -199,13 +206,15 @@ export class LocalRenderer {
     this.abort?.abort();
     const abort = new AbortController();
     this.abort = abort;
+    this.streaming = true;
     try {
       await painter.ready;
       const response = await openSplats(abort.signal);
       await readSplats(response, (header) => abort.signal.aborted || this.begin(painter, header), (block) => abort.signal.aborted || this.take(painter, block));
+      if (!abort.signal.aborted) this.streaming = false;
     } catch (error) {
       if (abort.signal.aborted) return;
-      this.version = 0;
+      [this.version, this.streaming] = [0, false];
       this.report(message(error));
     }
   }
@@ -251,6 +260,7 @@ export class LocalRenderer {
     if (this.version !== this.scene?.version) return;
     this.fetching = true;
     const { mask, abort } = this;
+    let answered = true;
     try {
       const bits = mask ? await openMask(this.version) : new Uint8Array(0);
       if (bits && abort === this.abort && painter === this.painter) {
@@ -259,11 +269,12 @@ export class LocalRenderer {
         this.redraw();
       }
     } catch (error) {
+      // The next state of the session, with which every connection begins, requests it again.
+      answered = false;
       this.report(message(error));
-      this.masked = mask;
     }
     this.fetching = false;
-    if (this.masked !== this.mask) setTimeout(() => this.fetchMask(), RETRY_DELAY);
+    if (this.masked !== this.mask && (answered || mask !== this.mask)) setTimeout(() => this.fetchMask(), RETRY_DELAY);
   }
 
   /** @param {Camera} camera @param {Intrinsics} k @param {any} shot */

@@ -71,7 +71,8 @@ pub(crate) async fn serve(mut socket: WebSocket, shared: Arc<Shared>) {
     news.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut edits = shared.subject.editing.as_ref().ok().map(|editing| editing.watch());
     let mut limiter = RateLimiter::new();
-    if !send(&mut socket, Message::text(hello(&shared).to_string())).await {
+    let greeting = hello(&shared, changed_scene(&shared, &mut version)).to_string();
+    if !send(&mut socket, Message::text(greeting)).await {
         return;
     }
     if let Some(edits) = &mut edits {
@@ -258,10 +259,9 @@ fn handle(shared: &Shared, client: u64, message: Message, limiter: &mut RateLimi
     Outcome::Continue
 }
 
-/// The first message to a page.
-fn hello(shared: &Shared) -> Value {
+/// The first message to a page, with the scene if there is one.
+fn hello(shared: &Shared, scene: Option<Value>) -> Value {
     let subject = &shared.subject;
-    let edition = subject.edition();
     json!({
         "tell": "hello",
         "program": concat!("Irradia ", env!("CARGO_PKG_VERSION")),
@@ -277,7 +277,7 @@ fn hello(shared: &Shared) -> Value {
         "warnings": subject.warnings,
         "editing": { "works": subject.editing.is_ok(), "why": subject.editing.as_ref().err() },
         "formats": downloads().map(|(name, format)| json!({ "name": name, "format": format.to_string() })).collect::<Value>(),
-        "scene": edition.as_ref().map(scene),
+        "scene": scene,
     })
 }
 

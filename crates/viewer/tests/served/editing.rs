@@ -86,6 +86,18 @@ fn pages_share_a_session_that_leaves_the_source_alone() {
 }
 
 #[test]
+fn a_page_is_told_the_scene_once() {
+    let served = serve("127.0.0.1");
+    let mut page = served.socket();
+    let told = [(); 2].map(|()| {
+        let (_, text) = page.receive().expect("a message");
+        let message: Value = serde_json::from_slice(&text).expect("JSON");
+        (message["tell"].clone(), message["scene"]["version"].clone())
+    });
+    assert_eq!(told, [(json!("hello"), json!(1)), (json!("editing"), Value::Null)]);
+}
+
+#[test]
 fn a_page_learns_whether_it_comes_back_to_the_same_server() {
     let served = serve("127.0.0.1");
     let hello = |served: &Served| next_message(&mut served.socket(), "hello");

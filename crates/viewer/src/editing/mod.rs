@@ -20,6 +20,7 @@ use tokio::sync::watch;
 
 use save::folder_of;
 pub(crate) use save::stem_of;
+use session::Session;
 use uploads::Uploads;
 pub(crate) use worker::run_editing;
 pub(crate) use world::moved_camera;
@@ -44,8 +45,8 @@ struct Queue {
     closing: bool,
 }
 
-/// The edited scene and its list of edits.
-type EditedScene = (Arc<Draft>, Arc<EditList>);
+/// The edited scene and its list of edits as TOML.
+type EditedScene = (Arc<Draft>, Arc<str>);
 
 pub(crate) struct Editing {
     /// The file of the scene.
@@ -121,8 +122,16 @@ impl Editing {
         self.request_added.notify_all();
     }
 
-    fn set_current(&self, draft: &Arc<Draft>, list: EditList) {
-        *lock(&self.current) = Some((draft.clone(), Arc::new(list)));
+    /// Sets the edited scene to that of `session`; returns its list of edits as TOML. Each edit makes a new draft: for the same draft,
+    /// the list is not written out again.
+    fn set_current(&self, session: &Session) -> Arc<str> {
+        let draft = session.draft();
+        if let Some((_, list)) = self.current().filter(|(known, _)| Arc::ptr_eq(known, draft)) {
+            return list;
+        }
+        let list: Arc<str> = session.list().to_toml().into();
+        *lock(&self.current) = Some((draft.clone(), list.clone()));
+        list
     }
 
     fn current(&self) -> Option<EditedScene> {
@@ -143,6 +152,40 @@ impl Editing {
     /// The list of edits as TOML.
     pub fn list(&self) -> String {
         self.current()
-            .map_or_else(|| EditList::default().to_toml(), |(_, list)| list.to_toml())
+            .map_or_else(|| EditList::default().to_toml(), |(_, list)| list.to_string())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use irradia_edit::{Operation, SelectStep, Shape};
+
+    #[test]
+    fn the_list_is_written_out_again_only_after_an_edit() {
+        let cloud = GaussianCloud {
+            means: vec![[0.0; 3]; 2],
+            quats: vec![[1.0, 0.0, 0.0, 0.0]; 2],
+            log_scales: vec![[-2.0; 3]; 2],
+            opacity_logits: vec![1.0; 2],
+            sh: vec![0.3; 6],
+            ..GaussianCloud::default()
+        };
+        let editing = Editing::new("a.ply".into(), 2);
+        let mut session = Session::new(Draft::new(cloud, Vec::new()), editing.uploads.clone());
+        let opened = editing.set_current(&session);
+        session
+            .select(1, true, vec![SelectStep::add(Shape::All {})])
+            .expect("selected");
+        assert!(Arc::ptr_eq(&opened, &editing.set_current(&session)), "a selection");
+        for factor in [0.5, 0.25] {
+            let before = editing.list();
+            session.edit(2, false, Operation::Opacity { factor }).expect("edited");
+            editing.set_current(&session);
+            assert_ne!(editing.list(), before);
+            assert_eq!(editing.list(), session.list().to_toml());
+        }
+        session.go_to(0).expect("undone");
+        assert_eq!(*editing.set_current(&session), *opened);
     }
 }

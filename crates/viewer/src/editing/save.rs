@@ -5,6 +5,7 @@ use super::session::Session;
 use irradia_runs::formats::{FormatError, SplatFormat, write_atomic, write_splats};
 use irradia_runs::write_own_cameras;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::{fs, io};
 
 /// Where a session has been saved.
@@ -116,7 +117,7 @@ pub(super) fn save(session: &Session, source: &Path, before: Option<&Saved>) -> 
 #[derive(Default)]
 pub(super) struct UnsavedEdits {
     /// The file and the list as it was written; `None` if nothing is unsaved.
-    written: Option<(PathBuf, String)>,
+    written: Option<(PathBuf, Arc<str>)>,
     /// The scenes that the list merged when they were last written.
     merged: Vec<String>,
 }
@@ -127,20 +128,24 @@ impl UnsavedEdits {
         self.written.as_ref().map(|(path, _)| path.as_path())
     }
 
-    /// Writes the session's list to the file if it differs from what is written and saved; removes the file if nothing is unsaved.
+    /// Writes the session's `list` to the file if it differs from what is written and saved; removes the file if nothing is unsaved.
     ///
     /// # Errors
     /// When a file cannot be written or removed.
-    pub fn update(&mut self, session: &Session, source: &Path, saved: Option<&Saved>) -> Result<(), EditingError> {
-        let list = session.list();
-        let text = list.to_toml();
-        if list.edits.is_empty() || saved.is_some_and(|saved| saved.text == text) {
+    pub fn update(
+        &mut self,
+        session: &Session,
+        list: Arc<str>,
+        source: &Path,
+        saved: Option<&Saved>,
+    ) -> Result<(), EditingError> {
+        if session.edits().next().is_none() || saved.is_some_and(|saved| *saved.text == *list) {
             return self.remove();
         }
-        if self.written.as_ref().is_none_or(|(_, written)| *written != text) {
+        if self.written.as_ref().is_none_or(|(_, written)| *written != list) {
             let path = self.path().map_or_else(|| new_unsaved_path(source), Path::to_owned);
-            write_atomic(&path, |out| out.write_all(text.as_bytes()))?;
-            self.written = Some((path, text));
+            write_atomic(&path, |out| out.write_all(list.as_bytes()))?;
+            self.written = Some((path, list));
         }
         // After the list: a merged scene that cannot be written must not lose it.
         let merged: Vec<String> = session.merged().map(str::to_owned).collect();
@@ -177,7 +182,6 @@ mod tests {
     use crate::editing::uploads::Uploads;
     use irradia_edit::{Draft, Operation};
     use irradia_runs::scene::GaussianCloud;
-    use std::sync::Arc;
 
     #[test]
     fn a_scene_is_named_without_its_format() {
@@ -212,7 +216,8 @@ mod tests {
         let mut session = Session::new(Draft::new(cloud, Vec::new()), Arc::new(Uploads::new(folder.path())));
         let mut unsaved = UnsavedEdits::default();
         let mut keep = |session: &Session, saved: Option<&Saved>| {
-            unsaved.update(session, &source, saved).unwrap();
+            let list = session.list().to_toml().into();
+            unsaved.update(session, list, &source, saved).unwrap();
             assert_eq!(unsaved.path(), file.exists().then_some(file.as_path()));
             fs::read_to_string(&file).ok()
         };

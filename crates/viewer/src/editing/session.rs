@@ -121,7 +121,8 @@ impl Session {
             .map_or(0, |last| self.entries[last].gesture)
     }
 
-    fn edits(&self) -> impl Iterator<Item = &Edit> {
+    /// The edits that are made.
+    pub fn edits(&self) -> impl Iterator<Item = &Edit> {
         self.entries[..self.position]
             .iter()
             .filter_map(|entry| match &entry.action {
@@ -130,7 +131,7 @@ impl Session {
             })
     }
 
-    /// The edits that are made.
+    /// The list of the edits that are made.
     pub fn list(&self) -> EditList {
         EditList {
             edits: self.edits().cloned().collect(),

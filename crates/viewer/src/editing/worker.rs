@@ -65,9 +65,8 @@ pub(crate) fn run_editing(
         state["busy"] = false.into();
         if let Some(workspace) = &mut workspace {
             workspace.show(subject);
-            editing.set_current(workspace.session.draft(), workspace.session.list());
             let failed_before = workspace.save_failed;
-            if let Err(error) = workspace.write_unsaved(editing)
+            if let Err(error) = workspace.keep_edits(editing)
                 && !failed_before
             {
                 tell(client, &format!("unsaved edits would be lost in a crash: {error}"));
@@ -78,7 +77,7 @@ pub(crate) fn run_editing(
         editing.publish(state);
     }
     let mut workspace = workspace?;
-    let kept = workspace.write_unsaved(editing);
+    let kept = workspace.keep_edits(editing);
     match (workspace.unsaved.path().map(Path::display), kept) {
         (None, Ok(())) => None,
         (Some(path), Ok(())) => Some(format!(
@@ -144,9 +143,12 @@ impl Workspace {
         Ok(None)
     }
 
-    /// Writes the unsaved edits beside the scene.
-    fn write_unsaved(&mut self, editing: &Editing) -> Result<(), EditingError> {
-        let kept = self.unsaved.update(&self.session, &editing.source, self.saved.as_ref());
+    /// Updates what pages download, and the file of unsaved edits beside the scene.
+    fn keep_edits(&mut self, editing: &Editing) -> Result<(), EditingError> {
+        let list = editing.set_current(&self.session);
+        let kept = self
+            .unsaved
+            .update(&self.session, list, &editing.source, self.saved.as_ref());
         self.save_failed = kept.is_err();
         kept
     }

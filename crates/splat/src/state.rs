@@ -135,9 +135,15 @@ impl SplatState {
     }
 
     /// Keeps the splats `kept`, adds `added` with moments of zero, resets the moments of the splats `reset` (ascending), clears the
-    /// statistics, and puts all into Morton order: a round of density control in one pass over the state, column by column, so that
+    /// statistics of all but those that `keeps_statistics` accepts, and puts all into Morton order: a round of density control in one pass over the state, column by column, so that
     /// it needs hardly more memory than the state itself.
-    pub fn rebuild(&mut self, kept: Vec<u32>, added: &[&Splats], reset: &[u32]) {
+    pub fn rebuild(
+        &mut self,
+        kept: Vec<u32>,
+        added: &[&Splats],
+        reset: &[u32],
+        keeps_statistics: impl Fn(u32) -> bool + Sync,
+    ) {
         let n = self.len() as u32;
         let new = added.iter().map(|splats| splats.len() as u32).sum::<u32>();
         let mut order = kept;
@@ -154,12 +160,15 @@ impl SplatState {
             column.rearrange(&order, &added, &mut scratch);
         }
         self.filter.rearrange(&order, &[], &mut scratch);
+        let kept_statistics = |i: &u32| if *i < n && keeps_statistics(*i) { *i } else { u32::MAX };
+        let statistics: Vec<u32> = order.par_iter().map(kept_statistics).collect();
+        self.statistics.rearrange(&statistics, &[], &mut scratch);
+        drop(statistics);
         let kept_moment = |i: &u32| if reset.binary_search(i).is_ok() { u32::MAX } else { *i };
         let order: Vec<u32> = order.par_iter().map(kept_moment).collect();
         for column in self.moments.iter_mut().flat_map(Splats::columns_mut) {
             column.rearrange(&order, &[], &mut scratch);
         }
-        self.statistics.reset(order.len());
     }
 
     /// Every column with an item for each splat.
@@ -465,7 +474,9 @@ mod tests {
         let mut before = SplatState::new(random(n));
         before.moments = [random(n), random(n)];
         before.filter.plane_mut(0)[..n].fill(0.5);
-        before.statistics.plane_mut(1)[..n].fill(3.0);
+        for i in 0..n {
+            before.statistics.set(1, i, 1.0 + i as f32);
+        }
         let added = [random(700), random(90)];
         let kept: Vec<u32> = (0..n as u32).filter(|i| i % 7 != 3).collect();
         let reset: Vec<u32> = (0..n as u32).step_by(70).collect();
@@ -479,9 +490,8 @@ mod tests {
         for threads in [1, 2] {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             let mut state = before.clone();
-            pool.install(|| state.rebuild(kept.clone(), &[&added[0], &added[1]], &reset));
+            pool.install(|| state.rebuild(kept.clone(), &[&added[0], &added[1]], &reset, |i| i % 5 == 0));
             assert_eq!(state.len(), sources.len());
-            assert!(state.statistics.as_slice().iter().all(|v| *v == 0.0));
             for (to, from) in order.iter().enumerate() {
                 let (part, i) = sources[*from as usize];
                 let stays = part == 0 && reset.binary_search(&(i as u32)).is_err();
@@ -495,6 +505,8 @@ mod tests {
                     }
                 }
                 assert_eq!(state.filter.get(0, to), if part == 0 { 0.5 } else { 0.0 });
+                let keeps = part == 0 && i % 5 == 0;
+                assert_eq!(state.statistics.get(1, to), if keeps { 1.0 + i as f32 } else { 0.0 });
             }
         }
     }

@@ -274,6 +274,7 @@ fn density(engine: &mut Engine, state_bytes: f64, step: f64, limits: &Limits) {
         target: n + n / 20,
         min_opacity: 0.13,
         min_weight: 0.0,
+        min_frames: 2.0,
         error_threshold: 0.0,
         min_extent: 0.0,
     };

@@ -22,21 +22,24 @@ pub struct FastOptions {
     pub min_opacity: f32,
     /// Mean weight per frame, in pixels, below which a splat is removed.
     pub min_weight: f32,
+    /// Minimum number of frames in which a splat must have been in view to be removed for its weight.
+    pub min_frames: f32,
     /// Minimum mean error per frame, mean absolute colour difference times pixels, for a splat to be split.
     pub error_threshold: f32,
     /// Minimum half size on screen, pixels, for a splat to be worth splitting.
     pub min_extent: f32,
 }
 
-/// Frames in which a splat must have been visible before its statistics are used.
+/// Frames in which a splat must have been in view before it is split.
 const MIN_FRAMES: f32 = 2.0;
 
-/// Prunes and splits; clears the statistics and restores Morton order.
+/// Prunes and splits; restores Morton order, and clears the statistics of all splats but those in view too rarely to be split, which are
+/// judged by those of several rounds.
 pub fn densify(state: &mut SplatState, options: &FastOptions) -> DensityChange {
     let n = state.len();
     let stays = |i: usize| {
         let seen = state.statistics.get(SplatState::SEEN, i);
-        let shows = seen < MIN_FRAMES || state.mean_statistic(SplatState::WEIGHT, i) >= options.min_weight;
+        let shows = seen < options.min_frames || state.mean_statistic(SplatState::WEIGHT, i) >= options.min_weight;
         shows && state.splats.opacity(i) >= options.min_opacity && is_finite(&state.splats, i)
     };
     let mut kept = indices(n, stays);
@@ -63,7 +66,9 @@ pub fn densify(state: &mut SplatState, options: &FastOptions) -> DensityChange {
     let mut split: Vec<u32> = wanted.into_iter().map(|(_, i)| i).collect();
     split.par_sort_unstable();
     let halves = long_axis_halves(&state.splats, &split);
-    state.rebuild(without(kept, &split), &[&halves], &[]);
+    let seen = &state.statistics.plane(SplatState::SEEN)[..n];
+    let rarely_seen: Vec<bool> = seen.iter().map(|frames| *frames < MIN_FRAMES).collect();
+    state.rebuild(without(kept, &split), &[&halves], &[], |i| rarely_seen[i as usize]);
     DensityChange {
         cloned: 0,
         split: split.len(),
@@ -119,6 +124,7 @@ mod tests {
             floor: 0,
             min_opacity: 0.01,
             min_weight: 0.1,
+            min_frames: 2.0,
             error_threshold: 1.0,
             min_extent: 2.0,
         };
@@ -130,6 +136,42 @@ mod tests {
         );
         let near_zero = (0..4).filter(|i| state.splats.means.get(0, *i).abs() < 5.0).count();
         assert_eq!(near_zero, 2);
+    }
+
+    #[test]
+    fn splats_that_are_rarely_in_view_are_judged_by_several_rounds() {
+        let mut splats = Splats::zeros(2, 0);
+        for i in 0..2 {
+            splats.means.set(0, i, 10.0 * i as f32);
+            splats.quats.set(0, i, 1.0);
+            splats.opacity_logits.set(0, i, logit(0.5));
+        }
+        let mut state = SplatState::new(splats);
+        let options = FastOptions {
+            target: 4,
+            floor: 0,
+            min_opacity: 0.01,
+            min_weight: 0.1,
+            min_frames: 5.0,
+            error_threshold: 1.0,
+            min_extent: 2.0,
+        };
+        // In one frame of each round, and in four of the other's, which hide it.
+        for split in [0, 1] {
+            for i in 0..2 {
+                let first = state.splats.means.get(0, i) < 5.0;
+                for (plane, value) in [
+                    (SplatState::SEEN, if first { 1.0 } else { 4.0 }),
+                    (SplatState::EXTENT, 8.0),
+                    (SplatState::ERROR, if first { 3.0 } else { 0.0 }),
+                ] {
+                    let sum = state.statistics.get(plane, i) + value;
+                    state.statistics.set(plane, i, sum);
+                }
+            }
+            let change = densify(&mut state, &options);
+            assert_eq!((change.split, change.pruned), (split, 0));
+        }
     }
 
     #[test]
@@ -151,6 +193,7 @@ mod tests {
             floor: 2,
             min_opacity: 0.005,
             min_weight: 0.1,
+            min_frames: 2.0,
             error_threshold: 1.0,
             min_extent: 2.0,
         };

@@ -408,6 +408,7 @@ fn density_control_with_harmonics_on_the_device_gives_the_same_bits_as_the_whole
                 floor: 100,
                 min_opacity: 0.05,
                 min_weight: 0.001,
+                min_frames: 2.0,
                 error_threshold: 1e-9,
                 min_extent: 0.5,
             };

@@ -11,7 +11,8 @@ const MISFITS_AT: f64 = 0.2;
 /// Fractions of a run after which transients are hidden. At 0.2, surfaces at the border of a scene are not learned yet and are taken for
 /// transients; the later searches find the borders of what the first one found.
 const TRANSIENTS_AT: [f64; 3] = [0.3, 0.45, 0.6];
-/// Minimum number of a run's steps per training view for any decision: with fewer, the renders would cost more than a twentieth of the run.
+/// Minimum number of a run's steps per training view for a decision on every view: with fewer, the renders would cost more than a twentieth
+/// of the run.
 const MIN_STEPS_PER_VIEW: usize = 8;
 
 impl Trainer {
@@ -20,7 +21,7 @@ impl Trainer {
         let (total, now) = (self.recipe.total_steps() as f64, self.clock.time);
         let passes = |at: f64| before < at * total && now >= at * total;
         let mut events = Vec::new();
-        if self.total_steps() < (MIN_STEPS_PER_VIEW * self.trained.len()) as u64 {
+        if !self.can_render_all_views() {
             return Ok(events);
         }
         if self.recipe.drop_misfits && passes(MISFITS_AT) {
@@ -38,11 +39,16 @@ impl Trainer {
         Ok(events)
     }
 
+    /// Whether the run is long enough to render every training view once more.
+    pub(crate) fn can_render_all_views(&self) -> bool {
+        self.total_steps() >= (MIN_STEPS_PER_VIEW * self.trained.len()) as u64
+    }
+
     /// The error of each training view over all pixels, and over the pixels that fit best.
     fn training_errors(&mut self) -> Result<Vec<(usize, [f64; 2])>, TrainError> {
         let plan = plan(&self.recipe, &self.clock);
         let mut errors = Vec::with_capacity(self.trained.len());
-        self.render_training_views(self.trained.len(), &plan, false, |trainer, view, photo| {
+        self.render_training_views(&self.trained.clone(), &plan, false, |trainer, view, photo| {
             errors.push((view, trainer.frame_errors(photo)));
         })?;
         Ok(errors)
@@ -52,7 +58,7 @@ impl Trainer {
     fn find_transients(&mut self) -> Result<(), TrainError> {
         let plan = plan(&self.recipe, &self.clock);
         let mut differences = Vec::with_capacity(self.trained.len());
-        self.render_training_views(self.trained.len(), &plan, true, |trainer, view, photo| {
+        self.render_training_views(&self.trained.clone(), &plan, true, |trainer, view, photo| {
             let frame = FramePlanes {
                 color: trainer.sockets.frame_color(&trainer.engine),
                 ..trainer.engine.frame()
@@ -60,7 +66,7 @@ impl Trainer {
             let camera = trainer.camera(view);
             differences.push((view, Difference::new(&frame, photo, &camera, trainer.extent)));
         })?;
-        self.hidden = Hidden::find(&differences, self.extent, &self.hidden);
+        self.hidden = Hidden::find(&differences, self.length_unit, &self.hidden);
         Ok(())
     }
 

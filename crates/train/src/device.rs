@@ -108,7 +108,7 @@ fn needs_host(reference: &Reference, plan: &StepPlan, has_lpips: bool) -> bool {
         || weighs(Param::CoarseWeight)
         || weighs(Param::PerceptualWeight) && has_lpips
         || weighs(Param::AlphaWeight) && reference.photo.alpha.is_some()
-        || weighs(Param::MaskWeight) && reference.photo.mask.is_some()
+        || weighs(Param::MaskWeight) && reference.left_out.is_some()
         || weighs(Param::DepthMapWeight) && reference.depth_map.is_some()
         || weighs(Param::NormalMapWeight) && reference.normal_map.is_some()
         || weighs(Param::SmoothWeight)

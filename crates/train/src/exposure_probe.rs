@@ -7,16 +7,22 @@
 
 use crate::event::Event;
 use crate::photos::Prepared;
+use crate::recipe::Choice;
 use crate::robust::spread;
-use crate::schedule::plan;
+use crate::schedule::{plan, upcoming_views};
 use crate::socket::Exposure;
 use crate::trainer::{TrainError, Trainer};
 use irradia_scene::Camera;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Fraction of a run after which the decision is made.
-pub(crate) const PROBE_AT: f64 = 0.1;
-/// Maximum number of training views to measure: enough for a standard deviation accurate to a tenth.
-const MAX_VIEWS: usize = 64;
+const PROBE_AT: f64 = 0.1;
+/// Minimum number of steps per training view before the decision: splats that have seen a photograph once do not show its colours yet.
+const MIN_VISITS: usize = 2;
+/// Fraction of a run after which it is too late for the decision.
+const PROBE_UNTIL: f64 = 0.5;
+/// Number of training views to measure in a run too short to measure all: enough for a standard deviation accurate to a tenth.
+const SAMPLED_VIEWS: usize = 64;
 /// Minimum number of views for a decision.
 const MIN_VIEWS: usize = 8;
 /// Number of cameras that predict a view's exposure.
@@ -25,15 +31,18 @@ const NEIGHBOURS: usize = 3;
 const MIN_DEVIATION: f64 = 0.1;
 /// Usable colours: those outside are clipped in the photograph, or too dark for a ratio.
 const USABLE_COLORS: std::ops::RangeInclusive<f32> = 8.0 / 255.0..=250.0 / 255.0;
+/// Opacity from which on a pixel shows the scene, not what is missing from it.
+const MIN_ALPHA: f32 = 0.95;
 /// Minimum number of usable pixels of a view; a view with fewer is skipped.
 const MIN_PIXELS: usize = 100;
 
-/// Mean ln exposure of `photo` relative to `color` `[3, H, W]`, its frame; `None` if too few pixels of both can be compared.
-fn log_exposure(color: &[f32], photo: &Prepared) -> Option<f64> {
+/// Mean ln exposure of `photo` relative to its frame, `color` `[3, H, W]` of opacity `alpha` `[H, W]`; `None` if too few pixels of both can be
+/// compared.
+fn log_exposure(color: &[f32], alpha: &[f32], photo: &Prepared) -> Option<f64> {
     let pixels = photo.rgb.len() / 3;
     let counts = |i: &usize| {
         let opaque = photo.alpha.as_ref().is_none_or(|alpha| alpha[*i] == 255);
-        opaque && photo.mask.as_ref().is_none_or(|mask| mask[*i] != 0)
+        opaque && alpha[*i] >= MIN_ALPHA && photo.mask.as_ref().is_none_or(|mask| mask[*i] != 0)
     };
     let (mut ratios, mut frame_sum, mut photo_sum) = (0usize, 0.0f64, 0.0f64);
     for i in (0..pixels).filter(counts) {
@@ -48,20 +57,25 @@ fn log_exposure(color: &[f32], photo: &Prepared) -> Option<f64> {
     (ratios >= MIN_PIXELS).then(|| (photo_sum / frame_sum).ln())
 }
 
-/// Standard deviation of the ln exposures of `views` beyond what the nearest cameras predict; `None` for too few views. `unit` is
-/// the extent of the scene, which makes a turn by one radian count as much as a move by one extent.
+/// Mean ln exposure of the [`NEIGHBOURS`] views nearest to `camera`. A move by `unit` counts as much as a turn by one radian.
+fn predicted<'a>(camera: &Camera, views: impl Iterator<Item = &'a (Camera, f64)>, unit: f32) -> f64 {
+    let mut near: Vec<(f32, f64)> = views
+        .map(|(other, log)| (camera.pose.distance(&other.pose, unit), *log))
+        .collect();
+    near.sort_by(|a, b| a.0.total_cmp(&b.0));
+    near.truncate(NEIGHBOURS);
+    near.iter().map(|(_, log)| log).sum::<f64>() / near.len().max(1) as f64
+}
+
+/// Standard deviation of the ln exposures of `views` beyond what the nearest cameras predict; `None` for too few views. A move by `unit` counts
+/// as much as a turn by one radian.
 fn unpredicted_spread(views: &[(Camera, f64)], unit: f32) -> Option<f64> {
     if views.len() < MIN_VIEWS {
         return None;
     }
     let residual = |(i, (camera, own)): (usize, &(Camera, f64))| {
         let others = views.iter().enumerate().filter(|(k, _)| *k != i);
-        let mut near: Vec<(f32, f64)> = others
-            .map(|(_, (other, log))| (camera.pose.distance(&other.pose, unit), *log))
-            .collect();
-        near.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let predicted = near[..NEIGHBOURS].iter().map(|(_, log)| log).sum::<f64>() / NEIGHBOURS as f64;
-        own - predicted
+        own - predicted(camera, others.map(|(_, view)| view), unit)
     };
     // The spread is robust, since a few odd photographs are no reason for exposures; the mean of k independent values adds 1/k to the
     // variance.
@@ -70,22 +84,58 @@ fn unpredicted_spread(views: &[(Camera, f64)], unit: f32) -> Option<f64> {
 }
 
 impl Trainer {
+    /// Whether exposures are to be decided after a step that began at `before`, in steps of the recipe.
+    pub(crate) fn is_exposure_due(&self, before: f64) -> bool {
+        // A bilateral grid contains an exposure: there is nothing to decide.
+        if self.recipe.exposure != Choice::Auto || self.sockets.bilateral.is_some() || self.field.is_some() {
+            return false;
+        }
+        let total = self.recipe.total_steps() as f64;
+        let visits = (MIN_VISITS * self.trained.len()) as u64;
+        let is_ready = |time: f64, step: u64| time >= PROBE_AT * total && step >= visits;
+        let (now, step) = (self.clock.time, self.clock.step);
+        is_ready(now, step) && !is_ready(before, step - 1) && now <= PROBE_UNTIL * total
+    }
+
+    /// The training views to measure: all, or in a short run some with the nearest to each.
+    fn probed_views(&self) -> Vec<usize> {
+        if self.trained.len() <= SAMPLED_VIEWS || self.can_render_all_views() {
+            return self.trained.clone();
+        }
+        let upcoming = upcoming_views(&self.trained, self.options.seed, &self.clock);
+        let groups = upcoming.iter().take(SAMPLED_VIEWS / (1 + NEIGHBOURS));
+        let views: BTreeSet<usize> = groups
+            .flat_map(|view| {
+                let pose = self.camera(*view).pose;
+                let distance = |other: &usize| self.camera(*other).pose.distance(&pose, self.length_unit);
+                let mut nearest = self.trained.clone();
+                nearest.sort_by(|a, b| distance(a).total_cmp(&distance(b)));
+                nearest.truncate(1 + NEIGHBOURS);
+                nearest
+            })
+            .collect();
+        views.into_iter().collect()
+    }
+
     /// Adds an exposure per photograph if the photographs need it, and reports it.
     pub(crate) fn decide_exposure(&mut self) -> Result<Option<Event>, TrainError> {
         let plan = plan(&self.recipe, &self.clock);
-        let mut measured = Vec::new();
-        self.render_training_views(MAX_VIEWS, &plan, false, |trainer, view, photo| {
+        let mut measured = BTreeMap::new();
+        self.render_training_views(&self.probed_views(), &plan, false, |trainer, view, photo| {
             let color = trainer.sockets.frame_color(&trainer.engine);
-            measured.extend(log_exposure(color, photo).map(|log| (view, log)));
+            measured.extend(log_exposure(color, trainer.engine.frame().alpha, photo).map(|log| (view, log)));
         })?;
         let views: Vec<(Camera, f64)> = measured.iter().map(|(view, log)| (self.camera(*view), *log)).collect();
-        let Some(spread) = unpredicted_spread(&views, self.extent) else {
+        let Some(spread) = unpredicted_spread(&views, self.length_unit) else {
             return Ok(None);
         };
         if spread < MIN_DEVIATION {
             return Ok(None);
         }
-        let exposure = Exposure::new(self.dataset.views.len(), &self.dataset.train).with_gains(&measured);
+        let own = |view: &usize| measured.get(view).copied();
+        let log = |view| own(view).unwrap_or_else(|| predicted(&self.camera(*view), views.iter(), self.length_unit));
+        let logs: Vec<(usize, f64)> = self.trained.iter().map(|view| (*view, log(view))).collect();
+        let exposure = Exposure::new(self.dataset.views.len(), &self.dataset.train).with_gains(&logs);
         self.sockets.exposure = Some(exposure);
         Ok(Some(Event::Decided {
             message: format!(
@@ -145,9 +195,18 @@ mod tests {
         for value in &mut photo.rgb[..300] {
             *value = 255;
         }
-        let measured = log_exposure(&color, &photo).unwrap();
+        // Where the frame is empty, it is darker than the scene.
+        let mut alpha = vec![1.0; pixels];
+        let mut color = color;
+        for i in 300..pixels {
+            alpha[i] = 0.5;
+            for c in 0..3 {
+                color[c * pixels + i] *= 0.5;
+            }
+        }
+        let measured = log_exposure(&color, &alpha, &photo).unwrap();
         assert!((measured - 1.3f64.ln()).abs() < 0.01, "{measured}");
         photo.mask = Some(vec![0; pixels]);
-        assert_eq!(log_exposure(&color, &photo), None);
+        assert_eq!(log_exposure(&color, &alpha, &photo), None);
     }
 }

@@ -53,9 +53,9 @@ struct CoverageLosses<'a> {
     cover: f32,
     /// Weight of the difference from the photograph's alpha, `[H, W]`.
     alpha: Option<(f32, &'a [u8])>,
-    /// Weight of what covers pixels that the mask, `[H, W]`, leaves out.
+    /// Weight of what covers pixels that the photograph's own mask, `[H, W]`, leaves out.
     left_out: Option<(f32, &'a [u8])>,
-    /// The photograph's mask, `[H, W]`.
+    /// The pixels that count, `[H, W]`.
     mask: Option<&'a [u8]>,
 }
 
@@ -79,8 +79,10 @@ pub struct ObjectiveValues {
 
 /// The reference of a frame.
 pub struct Reference<'a> {
-    /// The photograph.
+    /// The photograph, with what is hidden from training masked.
     pub photo: &'a Prepared,
+    /// The photograph's own mask: pixels that show nothing of the scene, `[H, W]`. What is hidden from training is not empty.
+    pub left_out: Option<&'a [u8]>,
     /// Background of the photograph and of the frame, if it is random per step.
     pub background: Option<[f32; 3]>,
     /// Known depths.
@@ -89,6 +91,17 @@ pub struct Reference<'a> {
     pub depth_map: Option<(&'a [DepthSample], DepthKind)>,
     /// Normals from a map given with the photograph, half of their spacing in pixels, and the camera.
     pub normal_map: Option<(&'a [NormalSample], u32, &'a Intrinsics)>,
+}
+
+impl Reference<'_> {
+    /// Whether a loss of `plan` compares depth, which then has to be rendered.
+    pub fn compares_depth(&self, plan: &StepPlan) -> bool {
+        let weighs = |param| plan.value(param) > 0.0;
+        weighs(Param::DepthWeight) && !self.depths.is_empty()
+            || weighs(Param::DepthMapWeight) && self.depth_map.is_some()
+            || weighs(Param::NormalMapWeight) && self.normal_map.is_some()
+            || weighs(Param::SmoothWeight)
+    }
 }
 
 impl Objective {
@@ -155,8 +168,8 @@ impl Objective {
                 total += f64::from(perceptual_weight) * loss;
             }
         }
-        let coverage = CoverageLosses::new(photo, plan);
-        let compares_depth = plan.compares_depth();
+        let coverage = CoverageLosses::new(reference, plan);
+        let compares_depth = reference.compares_depth(plan);
         self.present = PresentGradients {
             depth: compares_depth,
             alpha: compares_depth || coverage.any(),
@@ -303,7 +316,8 @@ impl DepthLosses {
 }
 
 impl<'a> CoverageLosses<'a> {
-    fn new(photo: &'a Prepared, plan: &StepPlan) -> Self {
+    fn new(reference: &Reference<'a>, plan: &StepPlan) -> Self {
+        let photo = reference.photo;
         let weighted = |param: Param, map: Option<&'a [u8]>| {
             let weight = plan.value(param);
             map.filter(|_| weight > 0.0).map(|map| (weight, map))
@@ -311,7 +325,7 @@ impl<'a> CoverageLosses<'a> {
         Self {
             cover: cover_weight(photo, plan),
             alpha: weighted(Param::AlphaWeight, photo.alpha.as_deref()),
-            left_out: weighted(Param::MaskWeight, photo.mask.as_deref()),
+            left_out: weighted(Param::MaskWeight, reference.left_out),
             mask: photo.mask.as_deref(),
         }
     }
@@ -415,13 +429,10 @@ mod tests {
     fn surfaces_are_wanted_where_photographs_show_something_and_none_where_masks_leave_out() {
         let photo = masked(128, [255, 255, 255, 255, 0, 0, 255, 255]);
         let (color, alpha) = ([0.5; 24], [0.9, 0.2, 1.0, 0.0, 0.9, 0.0, 0.5, 0.5]);
-        let v_alpha = |set: &str, photo: &Prepared| {
+        let gradient = |set: &str, photo: &Prepared, left_out: Option<&[u8]>| {
             let set = ["params.cover_weight=0", set].map(str::to_owned);
             let recipe = Recipe::parse("fast", Recipe::built_in("fast").unwrap(), &set).unwrap();
-            let mut plan = plan(&recipe, &Clock::new(&recipe));
-            plan.values[Param::DepthWeight] = 0.0;
-            plan.values[Param::DepthMapWeight] = 0.0;
-            plan.values[Param::NormalMapWeight] = 0.0;
+            let plan = plan(&recipe, &Clock::new(&recipe));
             let frame = FramePlanes {
                 color: &color,
                 alpha: &alpha,
@@ -429,6 +440,7 @@ mod tests {
             };
             let reference = Reference {
                 photo,
+                left_out,
                 background: None,
                 depths: &[],
                 depth_map: None,
@@ -436,8 +448,10 @@ mod tests {
             };
             let mut objective = Objective::new(None);
             objective.evaluate(frame, &reference, &plan, &mut Rng::new(1, 1));
+            assert!(objective.gradient().depth.is_none(), "there are no depths to compare");
             objective.gradient().alpha.map(<[f32]>::to_vec)
         };
+        let v_alpha = |set, photo: &Prepared| gradient(set, photo, photo.mask.as_deref());
         let covered = v_alpha("params.cover_weight=0.8", &photo).unwrap();
         let near = |got: &[f32], wanted: [f32; 8]| got.iter().zip(wanted).all(|(a, b)| (a - b).abs() < 1e-7);
         assert!(
@@ -447,6 +461,11 @@ mod tests {
         let masked = v_alpha("params.mask_weight=0.8", &photo).unwrap();
         assert!(near(&masked, [0.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0]), "{masked:?}");
         assert_eq!(v_alpha("params.mask_weight=0", &photo), None);
+        assert_eq!(
+            gradient("params.mask_weight=0.8", &photo, None),
+            None,
+            "what is hidden from training is not empty"
+        );
         let transparent = Prepared {
             alpha: Some(vec![255; 8]),
             ..photo.clone()
@@ -506,6 +525,7 @@ mod tests {
             };
             let reference = Reference {
                 photo: &photo,
+                left_out: None,
                 background: None,
                 depths: &[],
                 depth_map: Some((&samples, kind)),

@@ -21,6 +21,16 @@ pub(crate) fn pixel_size(dataset: &Dataset) -> f32 {
     median(dataset.train.par_iter().map(size).collect()) as f32
 }
 
+/// The depth of what a training view shows, world units: the median over views, of which there must be at least one.
+pub(crate) fn content_depth(dataset: &Dataset) -> f32 {
+    let focus = init::focus_point(&train_cameras(dataset));
+    let depth = |view: &usize| {
+        let view = &dataset.views[*view];
+        f64::from(view_depth(dataset, view, focus).max(view.camera.near))
+    };
+    median(dataset.train.par_iter().map(depth).collect()) as f32
+}
+
 /// The median depth of the points that a view sees, else the geometric mean of its depth bounds, else the distance of the cameras' `focus`.
 pub(crate) fn view_depth(dataset: &Dataset, view: &View, focus: Vec3) -> f32 {
     typical_depth(dataset, view).unwrap_or_else(|| focus.distance(view.camera.pose.position))

@@ -36,7 +36,7 @@ impl Trainer {
         let whole_photo = self.photos.get(&upcoming, plan.image_scale)?;
         let (started, cpu_started) = (Instant::now(), ProcessTime::now());
         let hidden = self.hidden.apply(view, &self.dataset.views[view].camera, &whole_photo);
-        let photo = hidden.map_or(whole_photo, Arc::new);
+        let photo = hidden.map_or_else(|| whole_photo.clone(), Arc::new);
         let mut rng = Stream::SplatStep.step_rng(self.options.seed, self.clock.step);
         let placement = self.sockets.place(view, &self.scaled_camera(view, plan.image_scale));
         let camera = placement.camera;
@@ -48,15 +48,10 @@ impl Trainer {
             .is_on(Param::RandomBackground)
             .then(|| std::array::from_fn(|_| rng.uniform()))
             .filter(|_| photo.alpha.is_some());
-        let base = self.render_options(plan.sh_degree);
-        let options = RenderOptions {
-            background: background.unwrap_or(base.background),
-            depth: plan.compares_depth(),
-            ..base
-        };
         let maps = self.given_maps(view, &photo, &camera, &plan);
         let reference = Reference {
             photo: &photo,
+            left_out: whole_photo.mask.as_deref(),
             background,
             depths: &self.known_depths(view, &camera, &plan),
             depth_map: maps.depths.as_ref().map(|(samples, kind)| (&samples[..], *kind)),
@@ -64,6 +59,12 @@ impl Trainer {
                 .normals
                 .as_ref()
                 .map(|(samples, reach)| (&samples[..], *reach, &camera.intrinsics)),
+        };
+        let base = self.render_options(plan.sh_degree);
+        let options = RenderOptions {
+            background: background.unwrap_or(base.background),
+            depth: reference.compares_depth(&plan),
+            ..base
         };
         let (update, has_lpips) = (self.update(&plan, view, &camera), self.options.lpips.is_some());
         let on_device = self.sockets.is_empty().then(|| {
@@ -77,7 +78,7 @@ impl Trainer {
                 self.sockets.render(&mut self.engine, view, placement, &options, &plan);
                 let loss = self.step_losses(&reference, (view, &camera), &plan, &mut rng);
                 self.sockets
-                    .step_before_blending(&mut self.engine, view, &camera, self.extent, &plan);
+                    .step_before_blending(&mut self.engine, view, &camera, self.length_unit, &plan);
                 self.engine.update(&update);
                 loss
             }
@@ -187,7 +188,7 @@ impl Trainer {
             regularizers: plan.regularizers(),
             regularized: self.recipe.regularizers.of.into(),
             regularizer_unit: match self.recipe.regularizers.unit {
-                LengthUnit::Extent => self.extent,
+                LengthUnit::Extent => self.length_unit,
                 LengthUnit::World => 1.0,
             },
             trained_fraction: plan.value(Param::TrainedShare),
@@ -214,8 +215,10 @@ impl Trainer {
 
     /// Mean L1 error over some training views, evenly spaced, as the plan renders them.
     fn measure_error(&mut self, plan: &StepPlan) -> Result<f64, TrainError> {
+        let stride = self.trained.len().div_ceil(MAX_MEASURED_VIEWS).max(1);
+        let views: Vec<usize> = self.trained.iter().copied().step_by(stride).collect();
         let (mut sum, mut count) = (0.0, 0);
-        self.render_training_views(MAX_MEASURED_VIEWS, plan, false, |trainer, view, photo| {
+        self.render_training_views(&views, plan, false, |trainer, view, photo| {
             let masked = trainer.hidden.apply(view, &trainer.dataset.views[view].camera, photo);
             sum += trainer.frame_errors(masked.as_ref().unwrap_or(photo))[0];
             count += 1;
@@ -248,7 +251,7 @@ impl Trainer {
         let limit = self
             .limit(self.clock.stage, round.count_share)
             .min(self.engine.max_splats());
-        let first = first_count(&self.dataset, &self.recipe);
+        let (first, views) = (first_count(&self.dataset, &self.recipe), self.trained.len());
         let mut rng = Stream::Density.step_rng(self.options.seed, self.clock.step);
         self.engine.edit_density(|state| {
             let cleared = self.free_space.clear(state);
@@ -271,7 +274,7 @@ impl Trainer {
                     let floor = ((f64::from(settings.floor) * self.pixels) as usize)
                         .min(first)
                         .min(limit);
-                    fast::densify(state, &settings.options(self.pace, floor, limit))
+                    fast::densify(state, &settings.options(self.pace, views, floor, limit))
                 }
             };
             DensityChange {

@@ -4,7 +4,6 @@
 use crate::depth_maps::DepthMaps;
 use crate::device::{DeviceLoss, use_device};
 use crate::event::{Event, StepReport};
-use crate::exposure_probe;
 use crate::field_step::{first_field, is_field};
 use crate::first_splats::first_count;
 use crate::free_space::FreeSpace;
@@ -15,8 +14,8 @@ use crate::model::Model;
 use crate::normal_maps::NormalMaps;
 use crate::objective::Objective;
 use crate::photos::{PhotoCache, Prepared};
-use crate::pixel_size::pixel_size;
-use crate::recipe::{Choice, Recipe};
+use crate::pixel_size::{content_depth, pixel_size};
+use crate::recipe::Recipe;
 use crate::schedule::{Clock, StepMetrics, StepPlan, upcoming_views};
 use crate::socket::{Residual, Sky, Sockets};
 use crate::spacing::spacing;
@@ -137,6 +136,9 @@ pub struct Trainer {
     pub pace: f64,
     /// Extent of the scene, world units: 1.1 times the largest distance of a camera from their mean (3DGS).
     pub extent: f32,
+    /// The length that counts as much as one radian, or as one unit of a splat's size, world units: the extent, but at most the depth of what
+    /// most views show, since the extent of a walk is many times that.
+    pub(crate) length_unit: f32,
     /// The length to which the rate of the means is relative, world units: the extent, or a number of pixels at the depth of what most
     /// views show.
     pub(crate) rate_extent: f32,
@@ -257,6 +259,7 @@ impl Trainer {
             cpu_seconds: 0.0,
             times: Times::default(),
             extent,
+            length_unit: extent.min(content_depth(&dataset)),
             rate_extent: match recipe.extent_pixels {
                 pixels if pixels > 0.0 => pixels * pixel_size(&dataset),
                 _ => extent,
@@ -378,12 +381,7 @@ impl Trainer {
         self.check_device()?;
         let before = self.clock.time;
         let entered = self.tick(metrics) && !self.finished();
-        let total = self.recipe.total_steps() as f64;
-        let at = exposure_probe::PROBE_AT * total;
-        // A bilateral grid contains an exposure: there is nothing to decide.
-        let undecided = self.recipe.exposure == Choice::Auto && self.sockets.bilateral.is_none();
-        let probes = undecided && self.field.is_none();
-        if probes && before < at && self.clock.time >= at {
+        if self.is_exposure_due(before) {
             events.extend(self.decide_exposure()?);
         }
         if self.field.is_none() {
@@ -447,19 +445,16 @@ impl Trainer {
         self.objective.mean_errors(photo)
     }
 
-    /// Renders at most `max_views` training views, evenly spaced, as in `plan`, with depth if `depth`, and passes each with its whole
-    /// photograph to `visit`.
+    /// Renders `views`, in order, as in `plan`, with depth if `depth`, and passes each with its whole photograph to `visit`.
     pub(crate) fn render_training_views(
         &mut self,
-        max_views: usize,
+        views: &[usize],
         plan: &StepPlan,
         depth: bool,
         mut visit: impl FnMut(&mut Self, usize, &Prepared),
     ) -> Result<(), TrainError> {
         let upcoming = upcoming_views(&self.trained, self.options.seed, &self.clock);
-        let train = self.trained.clone();
-        let stride = train.len().div_ceil(max_views).max(1);
-        for view in train.into_iter().step_by(stride) {
+        for view in views.iter().copied() {
             let order: Vec<usize> = std::iter::once(view)
                 .chain(upcoming.iter().copied().filter(|other| *other != view))
                 .collect();

@@ -199,14 +199,15 @@ fn quantile(values: &mut Vec<f32>, q: f32) -> Option<f32> {
 pub(crate) struct Hidden(BTreeMap<usize, Vec<bool>>);
 
 impl Hidden {
-    /// Finds what only one of `views` shows. Blocks that are hidden `already` are not used as witnesses.
-    pub fn find(views: &[(usize, Difference)], extent: f32, already: &Self) -> Self {
+    /// Finds what only one of `views` shows. Blocks that are hidden `already` are not used as witnesses. A move by
+    /// `length_unit` counts as much as a turn by one radian.
+    pub fn find(views: &[(usize, Difference)], length_unit: f32, already: &Self) -> Self {
         let found = |(view, own): &(usize, Difference)| {
             let mut others: Vec<(f32, usize)> = views
                 .iter()
                 .enumerate()
                 .filter(|(_, (other, _))| other != view)
-                .map(|(i, (_, other))| (own.camera.pose.distance(&other.camera.pose, extent), i))
+                .map(|(i, (_, other))| (own.camera.pose.distance(&other.camera.pose, length_unit), i))
                 .collect();
             others.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
             others.truncate(MAX_WITNESSES);
@@ -256,10 +257,11 @@ impl Hidden {
         let grid = Grid::from_intrinsics(&camera.intrinsics);
         let (width, height) = (photo.width as usize, photo.height as usize);
         let mut mask = photo.mask.clone().unwrap_or_else(|| vec![255; width * height]);
+        let columns: Vec<usize> = (0..width).map(|x| Grid::block(x, grid.columns, width)).collect();
         for (y, row) in mask.chunks_exact_mut(width).enumerate() {
-            let first = Grid::block(y, grid.rows, height) * grid.columns;
-            for (x, value) in row.iter_mut().enumerate() {
-                if blocks[first + Grid::block(x, grid.columns, width)] {
+            let blocks = &blocks[Grid::block(y, grid.rows, height) * grid.columns..];
+            for (value, column) in row.iter_mut().zip(&columns) {
+                if blocks[*column] {
                     *value = 0;
                 }
             }

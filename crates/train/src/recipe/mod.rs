@@ -283,7 +283,7 @@ impl From<RegularizedKind> for Regularized {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum LengthUnit {
-    /// The scene's extent.
+    /// The scene's extent, but at most the depth of what most views show.
     #[default]
     Extent,
     /// The dataset's own unit.

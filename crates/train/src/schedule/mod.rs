@@ -109,18 +109,6 @@ impl StepPlan {
         self.values[switch] >= 0.5
     }
 
-    /// Whether a depth loss is active, which requires depth to be rendered.
-    pub fn compares_depth(&self) -> bool {
-        [
-            Param::DepthWeight,
-            Param::DepthMapWeight,
-            Param::NormalMapWeight,
-            Param::SmoothWeight,
-        ]
-        .into_iter()
-        .any(|weight| self.value(weight) > 0.0)
-    }
-
     /// Weights of the regularisers.
     pub fn regularizers(&self) -> Regularizers {
         Regularizers {

@@ -331,13 +331,13 @@ impl Sockets {
     }
 
     /// One step of the occupants before projection and at colour, after the frame's backward pass. `camera` is the rendered camera,
-    /// `extent` the scene's extent in world units.
+    /// `length_unit` the length in world units that counts as much as one radian.
     pub fn step_before_blending(
         &mut self,
         engine: &mut Engine,
         view: usize,
         camera: &Camera,
-        extent: f32,
+        length_unit: f32,
         plan: &StepPlan,
     ) {
         let residual = self.residual.as_mut().filter(|residual| residual.is_active(plan));
@@ -353,7 +353,7 @@ impl Sockets {
             }
         }
         if let (Some(poses), Some(gradient)) = (&mut self.poses, engine.camera_gradient()) {
-            poses.step(view, camera, &gradient, plan.value(Param::RatePoses), extent);
+            poses.step(view, camera, &gradient, plan.value(Param::RatePoses), length_unit);
         }
     }
 }

@@ -48,10 +48,10 @@ impl PoseRefinement {
     }
 
     /// One step of Adam on `view`. `camera` is the corrected camera that was rendered, `gradient` its gradient; `rate` is in
-    /// radians, and in units of `extent` for the translation.
-    pub fn step(&mut self, view: usize, camera: &Camera, gradient: &CameraGradient, rate: f32, extent: f32) {
+    /// radians, and in units of `length_unit` for the translation.
+    pub fn step(&mut self, view: usize, camera: &Camera, gradient: &CameraGradient, rate: f32, length_unit: f32) {
         let v = tangent_gradient(camera, gradient);
-        let shift = rate * extent;
+        let shift = rate * length_unit;
         let step = self.adam.step(view, v, [rate, rate, rate, shift, shift, shift]);
         let common = Twist::from(step)
             .to_world(&camera.pose)

@@ -1,6 +1,6 @@
 //! Conversion of a scene from one splat format to another, and its cost: bytes, splats and, for lossy formats, PSNR.
 
-use crate::folder::cameras_beside;
+use crate::cameras::cameras_beside;
 use crate::levels::write_scene;
 use crate::orbit::orbit;
 use crate::{RunError, check_not_overwritten, residual_left_out, scene_path};

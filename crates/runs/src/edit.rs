@@ -1,6 +1,7 @@
 //! Edits of a scene on disk: read the scene, apply a list of edits, write the result.
 
-use crate::folder::{SKY, VIGNETTE, cameras_beside, moved_cameras_json, write_own_cameras};
+use crate::cameras::{CAMERAS, cameras_beside, moved_cameras_json, write_own_cameras};
+use crate::folder::{SKY, VIGNETTE};
 use crate::levels::write_scene;
 use crate::lock::FolderLock;
 use crate::photographs::photographs_of;
@@ -137,7 +138,7 @@ impl Editing {
         if !is_file {
             fs::create_dir_all(output).map_err(RunError::io("create", output))?;
             let folder = RunFolder::at(output);
-            let cameras = ("cameras.json", moved_cameras_json(&self.path, &self.moved));
+            let cameras = (CAMERAS, moved_cameras_json(&self.path, &self.moved));
             // Rendering needs these.
             let others =
                 ["recipe.toml", SKY, VIGNETTE].map(|name| (name, fs::read(self.path.with_file_name(name)).ok()));

@@ -1,6 +1,6 @@
 //! Levels of detail beside a splat file: a half, a quarter and an eighth of its splats, merged so that they look the same from afar.
 
-use crate::folder::cameras_beside;
+use crate::cameras::cameras_beside;
 use crate::orbit::orbit;
 use crate::{RunError, psnr_8_bits, scene_path};
 use irradia_formats::{SplatFormat, WriteOptions, read_splats, splat_file_size, write_splats_with};

@@ -42,6 +42,7 @@
 #![forbid(unsafe_code)]
 
 mod background;
+mod cameras;
 mod compact;
 mod convert;
 mod describe;
@@ -68,6 +69,7 @@ mod snapshot;
 mod synth_files;
 
 pub use background::Background;
+pub use cameras::{is_moved, moved_from_run, write_own_cameras};
 pub use compact::{CompactEvent, CompactInput, CompactTarget, Compacted, compact};
 pub use convert::{COMPARED_VIEWS, Conversion, convert};
 pub use describe::describe;
@@ -76,9 +78,7 @@ pub use error::RunError;
 pub use evaluate::{
     NOT_MEASURED, distinct, evaluate, file_stem, file_stems, leave_out_unreadable, psnr_8_bits, unmeasured,
 };
-pub use folder::{
-    FIELD, POSED_FOLDER, RESIDUAL, RunFolder, RunRecord, SCENE, is_moved, moved_from_run, write_own_cameras,
-};
+pub use folder::{FIELD, POSED_FOLDER, RESIDUAL, RunFolder, RunRecord, SCENE};
 pub use irradia_formats as formats;
 pub use irradia_scene as scene;
 pub use irradia_synth as synth;

@@ -1,7 +1,7 @@
 //! Reduced photographs of a run, for the search for floaters.
 
 use crate::RunFolder;
-use crate::folder::{camera_names_beside, is_moved};
+use crate::cameras::{camera_names_beside, is_moved};
 use crate::scene_file::render_settings_beside;
 use irradia_edit::{LoadedPhotographs, Photographs};
 use irradia_scene::Photo;

@@ -1,6 +1,7 @@
 //! A scene that can be rendered: read from a file or a run, or taken from a training.
 
-use crate::folder::{APPEARANCE, EXPOSURES, FIELD, RESIDUAL, SCENE, SKY, VIGNETTE, cameras_beside, world_beside};
+use crate::cameras::cameras_beside;
+use crate::folder::{APPEARANCE, EXPOSURES, FIELD, RESIDUAL, SCENE, SKY, VIGNETTE, world_beside};
 use crate::orbit::{OrbitGeometry, orbit, orbit_geometry};
 use crate::{RunError, RunFolder};
 use irradia_edit::Draft;

@@ -1,18 +1,24 @@
 //! The cameras beside a scene: `cameras.json` of its run or folder, or a file of its own if the whole scene was moved.
 
-use crate::RunError;
 use crate::folder::to_json;
+use crate::{RunError, RunFolder};
 use glam::{DQuat, DVec3, Quat};
 use irradia_edit::Transform;
 use irradia_formats::write_atomic;
-use irradia_scene::{Camera, Intrinsics, Pose, Similarity};
+use irradia_scene::{Camera, Dataset, Intrinsics, Pose, Similarity, View};
 use irradia_train::Trainer;
 use serde::{Deserialize, Serialize};
+use std::collections::HashMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
 /// The cameras of a run, or of the folder of an edited scene.
 pub(crate) const CAMERAS: &str = "cameras.json";
+
+/// The [`difference`] from which on poses are of another world: that of refined poses is far smaller.
+const OTHER_POSES: f64 = 0.25;
+/// The [`difference`] up to which poses are equal but for rounding.
+const SAME_POSES: f64 = 1e-4;
 
 /// A camera in `cameras.json`: enough to orbit the scene later without its photographs.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -28,6 +34,23 @@ struct CameraRecord {
     position: [f64; 3],
     /// World from camera (x right, y down, z forward): w, x, y, z.
     rotation: [f32; 4],
+}
+
+impl CameraRecord {
+    fn placed(&self) -> Placed {
+        let [w, x, y, z] = self.rotation.map(f64::from);
+        Placed {
+            position: self.position.into(),
+            rotation: DQuat::from_xyzw(x, y, z, w).normalize(),
+        }
+    }
+}
+
+/// Where a camera is, in the dataset's coordinates.
+#[derive(Clone, Copy, Debug)]
+struct Placed {
+    position: DVec3,
+    rotation: DQuat,
 }
 
 /// An `f64` with the digits of an `f32`, so that files do not show digits beyond its precision.
@@ -83,35 +106,106 @@ pub fn is_moved(scene: &Path) -> bool {
 /// How the whole scene in the file `scene` was moved away from the photographs of the run whose folder contains it, in the dataset's
 /// coordinates: by its own cameras and those of the run.
 pub fn moved_from_run(scene: &Path) -> Transform {
-    let of_run = camera_records(&scene.with_file_name(CAMERAS));
-    match of_run.zip(camera_records(&own_cameras_file(scene))) {
-        Some((before, after)) => moved_between(&before, &after),
-        None => Transform::IDENTITY,
-    }
+    let of_run = camera_records(&scene.with_file_name(CAMERAS)).unwrap_or_default();
+    let own = camera_records(&own_cameras_file(scene)).unwrap_or_default();
+    let same = of_run.iter().zip(&own).filter(|(a, b)| a.name == b.name);
+    moved_between(&same.map(|(a, b)| [a.placed(), b.placed()]).collect::<Vec<_>>())
 }
 
-/// The transform that moves the cameras `before` to where they are `after`. Cameras that are all in one place do not determine a scale.
-fn moved_between(before: &[CameraRecord], after: &[CameraRecord]) -> Transform {
-    let pairs: Vec<_> = before.iter().zip(after).filter(|(a, b)| a.name == b.name).collect();
-    let Some(&(a, b)) = pairs.first() else {
+/// How the whole scene in the file `scene` was moved away from the photographs of `dataset`, in the dataset's coordinates: by the poses of
+/// the cameras that both have, by their names. The identity if there are none; `None` if no move explains their differences, since the scene
+/// was trained with other poses.
+pub fn moved_from_dataset(scene: &Path, dataset: &Dataset) -> Option<Transform> {
+    let views: HashMap<&str, &View> = dataset.views.iter().map(|view| (view.name.as_str(), view)).collect();
+    let records = camera_records(&cameras_file(scene)).unwrap_or_default();
+    let pair = |record: &CameraRecord| {
+        let pose = views.get(record.name.as_str())?.camera.pose;
+        let given = Placed {
+            position: dataset.world_from_dataset.invert(pose.position.as_dvec3()),
+            rotation: pose.rotation.as_dquat().normalize(),
+        };
+        Some([given, record.placed()])
+    };
+    let pairs: Vec<[Placed; 2]> = records.iter().filter_map(pair).collect();
+    let unmoved = difference(&pairs, &Transform::IDENTITY);
+    // The refined poses of a run may have drifted together, but its own scene is where its photographs are.
+    if unmoved > SAME_POSES && (is_moved(scene) || RunFolder::containing(scene).is_none()) {
+        let moved = moved_between(&pairs);
+        let rest = difference(&pairs, &moved);
+        // Refinement leaves a rest, too, but most of its differences are not a common move.
+        if rest < OTHER_POSES && 2.0 * rest < unmoved {
+            return Some(moved);
+        }
+    }
+    (unmoved < OTHER_POSES).then_some(Transform::IDENTITY)
+}
+
+/// The median difference between the second pose of each pair and the first one moved by `by`: the distance in units of the cameras' mean
+/// distance from their centre, plus the angle in radians. 0 without pairs.
+fn difference(pairs: &[[Placed; 2]], by: &Transform) -> f64 {
+    let (_, spread) = center_and_spread(pairs, 1);
+    let unit = if spread > 0.0 { spread } else { 1.0 };
+    let each = pairs.iter().map(|[from, to]| {
+        let angle = (by.rotation * from.rotation).angle_between(to.rotation);
+        by.apply(from.position).distance(to.position) / unit + angle
+    });
+    let mut each: Vec<f64> = each.collect();
+    each.sort_by(f64::total_cmp);
+    each.get(each.len() / 2).copied().unwrap_or(0.0)
+}
+
+/// The transform that moves the first poses of `pairs` to the second ones. Cameras that are all in one place do not determine a scale.
+fn moved_between(pairs: &[[Placed; 2]]) -> Transform {
+    let Some([first, moved_first]) = pairs.first() else {
         return Transform::IDENTITY;
     };
-    let rotation = |record: &CameraRecord| {
-        let [w, x, y, z] = record.rotation.map(f64::from);
-        DQuat::from_xyzw(x, y, z, w).normalize()
-    };
-    let distance = |from: &CameraRecord, to: &CameraRecord| DVec3::from(from.position).distance(to.position.into());
-    let spread: f64 = pairs.iter().map(|(other, _)| distance(a, other)).sum();
-    let moved_spread: f64 = pairs.iter().map(|(_, other)| distance(b, other)).sum();
+    let [(center, spread), (moved_center, moved_spread)] = [0, 1].map(|i| center_and_spread(pairs, i));
+    let some_rotation = moved_first.rotation * first.rotation.inverse();
+    let rotations = pairs.iter().map(|[from, to]| {
+        let rotation = to.rotation * from.rotation.inverse();
+        // Of the two quaternions of a rotation those that can be added.
+        if rotation.dot(some_rotation) < 0.0 {
+            -rotation
+        } else {
+            rotation
+        }
+    });
     let turn = Transform {
         scale: if spread > 0.0 { moved_spread / spread } else { 1.0 },
-        rotation: (rotation(b) * rotation(a).inverse()).normalize(),
+        rotation: rotations
+            .fold(DQuat::from_array([0.0; 4]), |sum, rotation| sum + rotation)
+            .normalize(),
         translation: DVec3::ZERO,
     };
     Transform {
-        translation: DVec3::from(b.position) - turn.apply(a.position.into()),
+        translation: moved_center - turn.apply(center),
         ..turn
     }
+}
+
+/// The mean of the positions at place `at` of each pair, and their mean distance from it.
+fn center_and_spread(pairs: &[[Placed; 2]], at: usize) -> (DVec3, f64) {
+    let (count, positions) = (pairs.len() as f64, pairs.iter().map(|pair| pair[at].position));
+    let center = positions.clone().sum::<DVec3>() / count;
+    (
+        center,
+        positions.map(|position| position.distance(center)).sum::<f64>() / count,
+    )
+}
+
+/// `dataset` after moving all of it in its own coordinates. As in edits, only rotations change coordinates of its world.
+pub(crate) fn moved(mut dataset: Dataset, by: &Transform) -> Dataset {
+    let turn = by.rotation.as_quat();
+    for view in &mut dataset.views {
+        let pose = &mut view.camera.pose;
+        pose.position = turn * pose.position;
+        pose.rotation = (turn * pose.rotation).normalize();
+    }
+    let points = dataset.points.iter_mut().flat_map(|points| &mut points.positions);
+    points.for_each(|point| *point = turn * *point);
+    let world = &mut dataset.world_from_dataset;
+    (world.scale, world.center) = (world.scale / by.scale, by.apply(world.center));
+    dataset
 }
 
 /// The cameras in `file`, if it can be read.
@@ -161,8 +255,8 @@ pub(crate) fn cameras_beside(scene: &Path, world_from_dataset: &Similarity) -> O
     Some(camera_records(&cameras_file(scene))?.iter().map(camera).collect())
 }
 
-/// The names of the views of [`cameras_beside`].
-pub(crate) fn camera_names_beside(scene: &Path) -> Option<Vec<String>> {
+/// The names of the views whose cameras [`Scene::read`](crate::Scene::read) finds beside the file `scene`, in the same order.
+pub fn camera_names(scene: &Path) -> Option<Vec<String>> {
     let records = camera_records(&cameras_file(scene))?;
     Some(records.into_iter().map(|record| record.name).collect())
 }

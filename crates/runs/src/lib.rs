@@ -69,7 +69,7 @@ mod snapshot;
 mod synth_files;
 
 pub use background::Background;
-pub use cameras::{is_moved, moved_from_run, write_own_cameras};
+pub use cameras::{camera_names, is_moved, moved_from_dataset, moved_from_run, write_own_cameras};
 pub use compact::{CompactEvent, CompactInput, CompactTarget, Compacted, compact};
 pub use convert::{COMPARED_VIEWS, Conversion, convert};
 pub use describe::describe;

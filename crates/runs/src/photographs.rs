@@ -1,7 +1,7 @@
 //! Reduced photographs of a run, for the search for floaters.
 
 use crate::RunFolder;
-use crate::cameras::{camera_names_beside, is_moved};
+use crate::cameras::{camera_names, is_moved};
 use crate::scene_file::render_settings_beside;
 use irradia_edit::{LoadedPhotographs, Photographs};
 use irradia_scene::Photo;
@@ -29,7 +29,7 @@ fn read(scene: &Path) -> Option<LoadedPhotographs> {
         return None;
     }
     let background = render_settings_beside(scene).background;
-    let names = camera_names_beside(scene)?;
+    let names = camera_names(scene)?;
     let step = names.len().div_ceil(MAX_PHOTOS).max(1);
     let photos: Option<Vec<(usize, Photo)>> = (0..names.len())
         .into_par_iter()

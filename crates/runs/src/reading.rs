@@ -2,7 +2,7 @@
 
 use crate::request::absolute;
 use crate::scene_file::same_file;
-use crate::{RunError, RunFolder};
+use crate::{RunError, RunFolder, Scene, cameras, moved_from_dataset, scene_path};
 use irradia_formats::{DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, Lenses, Readout, read_dataset};
 use irradia_scene::Dataset;
 use serde::{Deserialize, Serialize};
@@ -170,25 +170,41 @@ impl ReadingOptions {
         }
     }
 
-    /// Reads the dataset at `data` for `scene`, a file or a run's folder: absent settings are those of the run that contains the scene, and
-    /// so are, by their names, the held-out views. The caller shows the `warnings` of the dataset.
+    /// Reads the dataset at `data` for `scene`, which was read from `path`, a file or a run's folder, and brings it into the world of the
+    /// scene. Absent settings are those of the run that contains the scene, and so are, by their names, the held-out views. If the whole
+    /// scene was moved away from the photographs, their cameras follow. The caller shows the `warnings` of the dataset.
     ///
     /// # Errors
-    /// Those of [`Reading::read`]; when the run's list of views is damaged.
-    pub fn read_for(&self, scene: &Path, data: &Path) -> Result<Dataset, RunError> {
-        let mut reading = Reading::default();
-        if let Some(record) = RunFolder::record_containing(scene) {
+    /// Those of [`Reading::read`]; when the run's list of views is damaged, or its dataset has other poses by now.
+    pub fn read_for(&self, scene: &Scene, path: &Path, data: &Path) -> Result<Dataset, RunError> {
+        let (mut reading, mut is_own) = (Reading::default(), false);
+        if let Some(record) = RunFolder::record_containing(path) {
             reading = record.input.reading;
-            if !same_file(data, &record.input.data) {
+            is_own = same_file(data, &record.input.data);
+            if !is_own {
                 // Another dataset has a layout of its own.
                 (reading.format, reading.images) = (None, None);
             }
         }
         let mut dataset = self.with_fallback(reading).read(data)?;
-        if let (None, Some(folder)) = (&self.holdout, RunFolder::containing(scene)) {
+        if let (None, Some(folder)) = (&self.holdout, RunFolder::containing(path)) {
             // The run was trained on all others.
             folder.restore_holdout(&mut dataset)?;
         }
-        Ok(dataset)
+        let (shown_path, shown_data) = (path.display(), data.display());
+        match moved_from_dataset(&scene_path(path), &dataset) {
+            Some(moved) if moved.is_identity() => {}
+            Some(moved) => dataset = cameras::moved(dataset, &moved),
+            None if is_own => {
+                return Err(RunError::Refused(format!(
+                    "{shown_data} has other poses than those with which {shown_path} was trained: restore them, or train again"
+                )));
+            }
+            None => dataset.warnings.push(format!(
+                "views of {shown_data} have the names of views on which {shown_path} was trained, and other poses: unless both have the same \
+                 coordinates, they do not fit"
+            )),
+        }
+        Ok(scene.place(dataset))
     }
 }

@@ -1,7 +1,7 @@
 //! Training requests: raw input, and the validated request.
 
 use crate::pose::{find_points, lacks_points};
-use crate::{Background, Reading, RunError, RunFolder, is_moved, scene_path};
+use crate::{Background, Reading, RunError, RunFolder, is_moved, moved_from_dataset, scene_path};
 use irradia_compute::DeviceChoice;
 use irradia_formats::{DEFAULT_MAX_SIDE, DatasetOptions, Lenses, read_dataset, read_splats};
 use irradia_scene::{Dataset, sh};
@@ -372,11 +372,21 @@ impl TrainRequest {
     pub(crate) fn initial_splats(&self, dataset: &Dataset) -> Result<Option<(Splats, bool)>, RunError> {
         let Some(from) = &self.input.from else { return Ok(None) };
         let path = scene_path(from);
-        if is_moved(&path) {
-            return Err(RunError::Refused(format!(
-                "{} was moved away from its photographs: start from a scene whose edits do not move all of it",
-                path.display()
-            )));
+        match moved_from_dataset(&path, dataset) {
+            Some(moved) if moved.is_identity() && !is_moved(&path) => {}
+            Some(_) => {
+                return Err(RunError::Refused(format!(
+                    "{} was moved away from its photographs: start from a scene whose edits do not move all of it",
+                    path.display()
+                )));
+            }
+            None => {
+                return Err(RunError::Refused(format!(
+                    "{} was trained with other poses than those of {}: name the dataset on which it was trained",
+                    path.display(),
+                    self.input.data.display()
+                )));
+            }
         }
         let mut cloud = read_splats(&path)?;
         if cloud.is_empty() {

@@ -6,7 +6,7 @@ use crate::journal::Journal;
 use crate::lock::FolderLock;
 use crate::provenance::ViewList;
 use crate::snapshot::{SnapshotServer, Snapshots};
-use crate::{RunError, RunFolder, TrainRequest, background};
+use crate::{RunError, RunFolder, SCENE, TrainRequest, background, moved_from_dataset};
 use irradia_compute::{Device, DeviceChoice};
 use irradia_measure::Lpips;
 use irradia_scene::Dataset;
@@ -152,20 +152,25 @@ impl Run {
         let dataset = Arc::new(dataset);
         let trainer = match folder.newest_checkpoint()? {
             Some(path) => {
-                let differences = folder.changed_views(&views)?.join("; ");
+                let mut differences = folder.changed_views(&views)?;
                 if let Some(requested) = holdout
                     && *holdout != record.input.reading.holdout
                     && !differences.is_empty()
                 {
-                    let message =
-                        format!("the run holds out other views ({differences}): omit it to hold out the same ones");
+                    let message = format!(
+                        "the run holds out other views ({}): omit it to hold out the same ones",
+                        differences.join("; ")
+                    );
                     return Err(RunError::setting("holdout", requested, message));
+                }
+                if moved_from_dataset(&folder.file(SCENE), &dataset).is_none() {
+                    differences.push("its views have other poses".to_owned());
                 }
                 if !differences.is_empty() {
                     return Err(RunError::DataChanged {
                         folder: folder.path().to_owned(),
                         data: request.input.data.clone(),
-                        differences,
+                        differences: differences.join("; "),
                     });
                 }
                 read_checkpoint(&path, dataset, options)?

@@ -79,8 +79,8 @@ pub fn run(args: &Args) -> Result<()> {
     let mut scene = Scene::read(&args.scene)?;
     warn(&scene.notes);
     let data = data_for(args.data.as_deref(), &args.scene)?;
-    let dataset = args.reading.options().read_for(&args.scene, &data);
-    let dataset = scene.place(dataset.map_err(with_option_names)?);
+    let dataset = args.reading.options().read_for(&scene, &args.scene, &data);
+    let dataset = dataset.map_err(with_option_names)?;
     warn(&dataset.warnings);
     let background = match args.background {
         None if !has_background(&args.scene) => Background::default_for(&dataset, false)?,

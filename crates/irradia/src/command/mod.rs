@@ -115,13 +115,6 @@ impl DataArgs {
             ..Reading::default()
         })
     }
-
-    /// Reads the dataset; prints its warnings on standard error.
-    pub fn read(&self, path: &Path) -> Result<Dataset> {
-        let dataset = self.reading().read(path).map_err(with_option_names)?;
-        warn(&dataset.warnings);
-        Ok(dataset)
-    }
 }
 
 /// The dataset `given` with `--data`, else that of the run that contains `scene`.

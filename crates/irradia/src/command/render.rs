@@ -2,7 +2,7 @@
 
 use super::depths::Depths;
 use super::film::{self, FilmWriter};
-use super::{DataArgs, Split, rendering_device, thread_count, use_threads, warn};
+use super::{DataArgs, Split, rendering_device, thread_count, use_threads, warn, with_option_names};
 use crate::Usage;
 use crate::terminal::print_line;
 use anyhow::{Context, Result};
@@ -15,7 +15,8 @@ use std::path::{Path, PathBuf};
 #[derive(clap::Args)]
 #[command(group(clap::ArgGroup::new("cameras").required(true).args(["data", "orbit", "path"])))]
 pub struct Args {
-    /// The scene: RUN, or a file; background and filters are taken from the run that contains it
+    /// The scene: RUN, or a file; background, filters and, with --data, held-out views and the size of the photographs are taken from the
+    /// run that contains it
     pub scene: PathBuf,
     /// Render the views of this dataset
     #[arg(long)]
@@ -82,7 +83,9 @@ pub fn run(args: &Args) -> Result<()> {
         );
     }
     let data = args.data.as_ref().expect("clap requires one of them");
-    let dataset = scene.place(args.reading.read(data)?);
+    let dataset = args.reading.options().read_for(&scene, &args.scene, data);
+    let dataset = dataset.map_err(with_option_names)?;
+    warn(&dataset.warnings);
     let stems = file_stems(dataset.views.iter().map(|view| view.name.as_str()));
     let views = args.split.of(&dataset).into_iter();
     write_frames(

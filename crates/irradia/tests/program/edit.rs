@@ -30,7 +30,9 @@ fn edits_are_made_in_their_order_saved_and_replayed() {
         assert!(folder.path().join("edited").join(file).is_file(), "{file}");
     }
     irradia_with(folder.path(), "edit run --in-place", &["opacity factor=0.9"]).success();
-    irradia(folder.path(), "train data --from edited --out next --steps 2").success();
+    irradia(folder.path(), "train data --from edited --out next --steps 2").refused(2, &["edited/scene.ply", "moved"]);
+    irradia_with(folder.path(), "edit run -o clean", &["keep subject"]).success();
+    irradia(folder.path(), "train data --from clean --out next --steps 2").success();
     assert_no_leftovers(folder.path());
 }
 

@@ -151,9 +151,8 @@ pub fn compact(input: &CompactInput, on_event: &mut dyn FnMut(CompactEvent)) -> 
         let message = format!("{} is a radiance field: only splats can be compacted", file.display());
         return Err(RunError::Refused(message));
     };
-    let mut dataset = input.reading.read_for(&file, &input.data)?;
+    let mut dataset = input.reading.read_for(&scene, &file, &input.data)?;
     hold_out_readable(&mut dataset);
-    let dataset = scene.place(dataset);
     let mut notes = dataset.warnings.clone();
     notes.extend(residual_left_out(&file, "splat formats cannot hold it"));
     let measure = Measure::new(&dataset, scene.options, read_vignette(&file)?);

@@ -8,7 +8,7 @@ use crate::views::Views;
 use irradia_edit::Transform;
 use irradia_runs::formats::Lenses;
 use irradia_runs::{
-    Reading, ReadingOptions, Run, RunFolder, Scene, Snapshot, TrainInput, is_moved, moved_from_run, read_levels,
+    Reading, ReadingOptions, Run, RunFolder, Scene, Snapshot, camera_names, is_moved, moved_from_run, read_levels,
     read_lights, scene_path,
 };
 use irradia_scene::Dataset;
@@ -16,6 +16,7 @@ use irradia_splat::Splats;
 use irradia_splat::init::{InitOptions, from_points};
 use irradia_train::lights::Lights;
 use irradia_train::model::{Model, RenderOptions};
+use std::collections::HashMap;
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -126,22 +127,31 @@ impl Subject {
         let folder = folder.filter(|_| !is_moved(&file));
         let mut scene = Scene::read(&file)?;
         let mut warnings = std::mem::take(&mut scene.notes);
+        // The viewer draws pinhole pictures, which are compared with undistorted photographs.
+        let reading = ReadingOptions {
+            lenses: reading.lenses.or(Some(Lenses::Undistorted)),
+            ..reading.clone()
+        };
         let dataset = match (data, &folder) {
-            (Some(data), _) => Some(reading.with_fallback(Reading::default()).read(data)?),
+            (Some(data), _) => Some(reading.read_for(&scene, &file, data)?),
             // A run's photographs may have been moved: its scene can be viewed without them.
-            (None, Some(folder)) => TrainInput::of_run(folder.path())
-                .and_then(|mut input| {
-                    // The viewer draws pinhole pictures, which are compared with undistorted photographs.
-                    input.reading.lenses = Lenses::Undistorted;
-                    reading.with_fallback(input.reading).read(&input.data)
-                })
+            (None, Some(folder)) => RunFolder::open(folder.path())
+                .and_then(|(_, record)| reading.read_for(&scene, &file, &record.input.data))
                 .map_err(|error| warnings.push(format!("no photographs: {error}")))
                 .ok(),
             (None, None) => None,
         };
         let cameras = scene.cameras.clone();
-        let views = match dataset.map(|dataset| scene.place(dataset)) {
-            Some(dataset) => Views::of_dataset(&Arc::new(dataset), cameras.as_deref()),
+        let views = match dataset {
+            Some(dataset) => {
+                warnings.extend(dataset.warnings.iter().cloned());
+                let names = camera_names(&file).unwrap_or_default();
+                let cameras = cameras.iter().flat_map(|cameras| cameras.iter());
+                Views::of_dataset(
+                    &dataset,
+                    &names.into_iter().zip(cameras.map(|camera| camera.pose)).collect(),
+                )
+            }
             None => Views::of_cameras(cameras.as_deref().unwrap_or(&[])),
         };
         // Lights are numbered by the views of the run's own dataset.
@@ -201,7 +211,7 @@ impl Subject {
         let warnings = dataset.warnings.clone();
         Self {
             title: title(path),
-            views: Views::of_dataset(&Arc::new(dataset), None),
+            views: Views::of_dataset(&dataset, &HashMap::new()),
             editing: Err("A dataset has no splats to edit: these are its points."),
             live: None,
             folder: None,
@@ -219,11 +229,12 @@ impl Subject {
     /// A training, and the observer to give to [`Run::train`].
     pub fn of_run(run: &Run) -> (Self, Watcher) {
         let trainer = run.trainer();
-        let cameras: Vec<_> = trainer.dataset.train.iter().map(|view| trainer.camera(*view)).collect();
+        let dataset = &trainer.dataset;
+        let refined = |view: &usize| (dataset.views[*view].name.clone(), trainer.camera(*view).pose);
         let live = Arc::new(Live::new(run));
         let subject = Self {
             title: title(run.folder().path()),
-            views: Views::of_dataset(&trainer.dataset, Some(&cameras)),
+            views: Views::of_dataset(dataset, &dataset.train.iter().map(refined).collect()),
             editing: Err("A scene can be edited when its training has finished: open it with irradia view."),
             live: Some(live.clone()),
             folder: Some(run.folder().clone()),

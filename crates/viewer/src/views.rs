@@ -1,7 +1,8 @@
 //! The posed photographs of a scene, as far as they are known.
 
-use irradia_scene::{Camera, Dataset, Intrinsics, Lens, PhotoSource};
+use irradia_scene::{Camera, Dataset, Intrinsics, Lens, PhotoSource, Pose};
 use serde_json::{Value, json};
+use std::collections::HashMap;
 use std::f32::consts::FRAC_PI_2;
 use std::sync::Arc;
 
@@ -18,14 +19,12 @@ pub(crate) struct SeenView {
 pub(crate) struct Views(pub Vec<SeenView>);
 
 impl Views {
-    /// The views of a dataset. `trained` are the cameras of the training views with their refinement, if known.
-    pub fn of_dataset(dataset: &Arc<Dataset>, trained: Option<&[Camera]>) -> Self {
-        let refined = trained.filter(|cameras| cameras.len() == dataset.train.len());
+    /// The views of a dataset. `refined` are the poses of training views with their refinement, as far as they are known, by name: the
+    /// dataset may have gained or lost photographs since.
+    pub fn of_dataset(dataset: &Dataset, refined: &HashMap<String, Pose>) -> Self {
         let view = |(index, view): (usize, &irradia_scene::View)| {
-            let place = dataset.train.iter().position(|i| *i == index);
-            let pose = place.and_then(|place| Some(refined?[place].pose));
             let mut camera = view.camera;
-            camera.pose = pose.unwrap_or(camera.pose);
+            camera.pose = refined.get(&view.name).copied().unwrap_or(camera.pose);
             // The page draws pinhole cameras at rest: photographs with distortion or a rolling shutter cannot be compared with them.
             let is_pinhole = camera.is_pinhole();
             camera.shutter = None;
@@ -37,7 +36,7 @@ impl Views {
             SeenView {
                 name: view.name.clone(),
                 camera,
-                trained: place.is_some(),
+                trained: dataset.train.contains(&index),
                 photo: is_pinhole.then(|| view.photo.clone()),
             }
         };
@@ -71,5 +70,36 @@ impl Views {
             })
         };
         self.0.iter().map(view).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use irradia_runs::synth::{SynthOptions, dataset};
+
+    #[test]
+    fn refined_poses_belong_to_views_by_their_names() {
+        let options = SynthOptions {
+            views: 4,
+            width: 24,
+            height: 16,
+            ..SynthOptions::default()
+        };
+        let data = dataset(&options).expect("options");
+        let (first, last) = (data.train[0], data.train[3]);
+        // As many as training views, of which one is gone.
+        let refined = data.train[1..].iter().map(|view| data.views[*view].name.clone());
+        let pose = Pose {
+            position: [7.0, 8.0, 9.0].into(),
+            ..data.views[0].camera.pose
+        };
+        let refined = refined
+            .chain(["gone.png".to_owned()])
+            .map(|name| (name, pose))
+            .collect();
+        let views = Views::of_dataset(&data, &refined).0;
+        assert_eq!(views[first].camera.pose, data.views[first].camera.pose);
+        assert_eq!(views[last].camera.pose, pose);
     }
 }

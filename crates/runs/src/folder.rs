@@ -4,6 +4,7 @@ use crate::cameras::{CAMERAS, cameras_json};
 use crate::edit::EDITS;
 use crate::lock::FolderLock;
 use crate::provenance::ViewList;
+use crate::scene_file::same_file;
 use crate::{RunError, TrainInput};
 use irradia_formats::write_atomic;
 use irradia_scene::{Dataset, Similarity};
@@ -247,6 +248,13 @@ impl RunFolder {
     /// `run.json` of the run that contains the scene `path`, a file or a run's folder; `None` if there is none.
     pub fn record_containing(path: &Path) -> Option<RunRecord> {
         Some(Self::open(Self::containing(path)?.path()).ok()?.1)
+    }
+
+    /// The dataset of the run that contains the scene `path`, if its photographs were posed for it.
+    pub fn posed_dataset(path: &Path) -> Option<PathBuf> {
+        let folder = Self::containing(path)?;
+        let data = Self::open(folder.path()).ok()?.1.input.data;
+        same_file(&data, &folder.file(POSED_FOLDER)).then_some(data)
     }
 
     /// Writes the list of training and held-out views.

@@ -14,7 +14,7 @@ use irradia_compute::DeviceChoice;
 use irradia_runs::scene::Dataset;
 use irradia_runs::{
     Background, DEFAULT_RECIPE, Finished, NOT_MEASURED, PoseCheck, PoseSource, Reading, Run, RunError, RunFolder,
-    TrainInput, TrainRequest, check_poses, pose_source,
+    TrainInput, TrainRequest, check_poses, moved_from_dataset, pose_source, scene_path,
 };
 use irradia_train::event::Observer;
 use std::path::{Path, PathBuf};
@@ -180,6 +180,9 @@ pub fn run(args: &Args) -> Result<()> {
         (None, Some(run)) => begin(replay(run, args)?, args.viewer()),
         (None, None) => {
             let mut input = input(args)?;
+            if let Some(from) = &args.from {
+                keep_poses_of(from, &mut input, args.poses)?;
+            }
             if is_unposed(&input.data) {
                 // Posing takes a while: mistakes are reported first.
                 input.clone().check().map_err(with_option_names)?;
@@ -250,6 +253,34 @@ fn input(args: &Args) -> Result<TrainInput> {
         overwrite: args.overwrite,
         ..TrainInput::new(given(&args.data), given(&args.out))
     })
+}
+
+/// Makes sure that `input` does not combine splats of the scene `from` with new poses, which are in a world of their own. If the photographs
+/// of the run that contains `from` were posed for it, they replace photographs without poses or with others.
+fn keep_poses_of(from: &Path, input: &mut TrainInput, poses: Option<PosesArg>) -> Result<()> {
+    let (scene, data) = (from.display(), input.data.display());
+    if poses.and_then(PosesArg::mapper).is_some() {
+        let message = format!("--poses: new poses do not fit the splats of {scene}: omit it, or omit --from");
+        return Err(Usage(message).into());
+    }
+    let is_unposed = is_unposed(&input.data);
+    if !is_unposed && moved_from_dataset(&scene_path(from), &read(input.clone())?.1).is_some() {
+        return Ok(());
+    }
+    if let Some(posed) = RunFolder::posed_dataset(from) {
+        note(format_args!(
+            "the splats of {scene} fit the poses in {}, which replace {data}",
+            posed.display()
+        ));
+        input.data = posed;
+        (input.reading.format, input.reading.images) = (None, None);
+    } else if is_unposed {
+        let message = format!(
+            "{data} has no poses, and new ones do not fit the splats of {scene}: name the dataset on which it was trained"
+        );
+        return Err(Usage(message).into());
+    }
+    Ok(())
 }
 
 /// The dataset of `input`, whose photographs have poses: with the given poses, or with new ones if they are requested or the photographs

@@ -77,6 +77,36 @@ fn given_poses_that_photographs_contradict_are_replaced_and_others_are_on_reques
 }
 
 #[test]
+fn splats_are_trained_further_with_the_poses_of_their_run() {
+    let folder = with_data();
+    let here = |name: &str| folder.path().join(name);
+    fs::create_dir(here("run")).expect("a folder");
+    fs::rename(here("data"), here("run/posed")).expect("moved");
+    irradia(folder.path(), "train run/posed --out run --steps 2").success();
+    irradia(folder.path(), "synth data --views 8 --size 48x48").success();
+    // The given poses: each photograph has that of another.
+    let path = here("data/transforms_train.json");
+    let mut transforms = json(&path);
+    let frames = transforms["frames"].as_array_mut().expect("frames");
+    let mut poses: Vec<_> = frames.iter().map(|frame| frame["transform_matrix"].clone()).collect();
+    poses.rotate_left(1);
+    for (frame, pose) in frames.iter_mut().zip(poses) {
+        frame["transform_matrix"] = pose;
+    }
+    fs::write(&path, transforms.to_string()).expect("written");
+    let ended = irradia(folder.path(), "train data --from run --out again --steps 2").success();
+    assert!(ended.stderr.contains("fit the poses in run/posed"), "{ended:?}");
+    let record = json(&here("again/run.json"));
+    assert!(
+        record["data"].as_str().is_some_and(|data| data.ends_with("run/posed")),
+        "{record}"
+    );
+    irradia(folder.path(), "train data --from run --out x --poses irradia").refused(2, &["--poses", "--from"]);
+    fs::remove_dir_all(here("run/posed")).expect("removed");
+    irradia(folder.path(), "train data --from run --out x").refused(2, &["other poses", "data"]);
+}
+
+#[test]
 fn views_with_new_poses_are_trained_on_held_out_and_left_out_as_before() {
     let Some(door) = shared("data/lund_door") else {
         return;

@@ -4,6 +4,7 @@ use crate::cameras::{CAMERAS, cameras_json};
 use crate::edit::EDITS;
 use crate::lock::FolderLock;
 use crate::provenance::ViewList;
+use crate::request::absolute;
 use crate::scene_file::same_file;
 use crate::{RunError, TrainInput};
 use irradia_formats::write_atomic;
@@ -100,8 +101,11 @@ impl RunRecord {
     fn parse(text: &[u8], folder: &Path) -> Result<Self, serde_json::Error> {
         let mut record: Self = serde_json::from_slice(text)?;
         let (input, posed) = (&mut record.input, folder.join(POSED_FOLDER));
+        // In earlier records, the path to a dataset in the run's own folder is absolute.
         if input.data.ends_with(POSED_FOLDER) && !input.data.exists() && posed.is_dir() {
             input.data = posed;
+        } else {
+            input.data = folder.join(&input.data);
         }
         if input.reading.is_holdout_list_missing() && folder.join(VIEWS).is_file() {
             // The run knows its held-out views by name: [`RunFolder::restore_holdout`].
@@ -339,9 +343,15 @@ impl RunFolder {
         Ok(())
     }
 
-    /// Writes `run.json`.
+    /// Writes `run.json`. A dataset in the folder itself is recorded relative to it, since the run may be moved.
     pub(crate) fn write_record(&self, record: &RunRecord) -> Result<(), RunError> {
-        let bytes = serde_json::to_vec_pretty(record)
+        let mut record = record.clone();
+        if let Ok(inside) = record.input.data.strip_prefix(absolute(self.0.clone()))
+            && inside != Path::new("")
+        {
+            record.input.data = inside.to_owned();
+        }
+        let bytes = serde_json::to_vec_pretty(&record)
             .map_err(|e| RunError::Refused(format!("the request cannot be written to run.json: {e}")))?;
         self.write("run.json", &bytes)
     }

@@ -260,6 +260,22 @@ fn an_old_run_json_is_read() {
 }
 
 #[test]
+fn a_moved_run_keeps_the_photographs_that_were_posed_for_it() {
+    let folder = folder();
+    let [run, moved] = ["run", "moved"].map(|name| folder.path().join(name));
+    let posed = TrainInput {
+        data: run.join("posed"),
+        ..input(folder.path(), "run", 2)
+    };
+    drop(Run::begin_on(posed.check().expect("a request"), dataset()).expect("a run"));
+    fs::create_dir(run.join("posed")).expect("a folder");
+    fs::rename(&run, &moved).expect("moved");
+    // Another run takes its place.
+    fs::create_dir_all(run.join("posed")).expect("a folder");
+    assert_eq!(TrainInput::of_run(&moved).expect("a run").data, moved.join("posed"));
+}
+
+#[test]
 fn folders_without_a_run_get_one_line_of_error() {
     let folder = folder();
     let error = TrainInput::of_run(folder.path()).expect_err("no run");

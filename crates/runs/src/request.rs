@@ -56,7 +56,7 @@ pub struct TrainInput {
     pub max_splats: Option<usize>,
     /// Number of steps into which the recipe is fitted; its own number if `None`.
     pub steps: Option<u64>,
-    /// Seconds of training into which the recipe is fitted; not together with `steps`.
+    /// Seconds of training into which the recipe is fitted, all of them also if the run is resumed; not together with `steps`.
     pub budget: Option<f64>,
     /// The folder of a run whose steps are repeated at their recorded pace; not together with `steps` or `budget`.
     #[serde(default)]

@@ -125,7 +125,7 @@ impl Run {
     ///
     /// # Errors
     /// When the folder contains no run or is in use, its checkpoint is damaged, its dataset cannot be read or has different views from
-    /// those of the previous steps, or the request holds out others.
+    /// those of the previous steps, or the request holds out others or has a budget that is used up already.
     pub fn resume(request: TrainRequest) -> Result<Self, RunError> {
         let dataset = request.read_dataset()?;
         Self::resume_on(request, dataset)
@@ -178,6 +178,17 @@ impl Run {
             // Interrupted before its first checkpoint: no step depends on the earlier data.
             None => new_trainer(&request, dataset, options)?,
         };
+        if let Some(budget) = request.input.budget
+            && request.input.budget != record.input.budget
+            && budget <= trainer.seconds
+            && !trainer.finished()
+        {
+            let message = format!(
+                "the run has trained for {:.0} s already; a budget includes them",
+                trainer.seconds
+            );
+            return Err(RunError::setting("budget", budget, message));
+        }
         folder.write_views(&views)?;
         Self::new(folder, lock, request, trainer, paces)
     }

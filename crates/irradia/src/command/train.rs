@@ -72,8 +72,8 @@ pub struct Args {
     /// Stop at this held-out PSNR
     #[arg(long, value_name = "DB")]
     pub until_psnr: Option<f64>,
-    /// Fit the recipe into a training time, such as 90s or 5m. The progress depends on the speed of the machine, and so do the
-    /// bytes of the scene; --replay reproduces them
+    /// Fit the recipe into a training time, such as 90s or 5m, with --resume that of the whole run. The progress depends on the speed of
+    /// the machine, and so do the bytes of the scene; --replay reproduces them
     #[arg(long, value_name = "TIME", value_parser = parse_seconds)]
     pub budget: Option<f64>,
     /// Resume an interrupted run from its latest checkpoint; the result is that of an uninterrupted run. The same views are held out; a

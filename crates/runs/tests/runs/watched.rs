@@ -74,8 +74,20 @@ fn a_stopped_run_is_saved_and_resumes_to_the_bytes_of_an_uninterrupted_one() {
     let path = finished.folder.path().to_owned();
     assert!(path.join("checkpoints/step_5.safetensors").is_file());
 
-    let request = TrainInput::of_run(&path).expect("a run").check().expect("a request");
-    let mut run = Run::resume_on(request, dataset()).expect("resumed");
+    let of_run = || TrainInput::of_run(&path).expect("a run");
+    let budget = TrainInput {
+        steps: None,
+        budget: Some(1e-9),
+        ..of_run()
+    };
+    let error = Run::resume_on(budget.check().expect("a request"), dataset())
+        .err()
+        .expect("used up");
+    assert!(
+        error.to_string().starts_with("budget 0.000000001: the run has trained"),
+        "{error}"
+    );
+    let mut run = Run::resume_on(of_run().check().expect("a request"), dataset()).expect("resumed");
     run.train(&mut []).expect("trains");
     let finished = run.finish().expect("finishes");
     assert!(finished.complete);

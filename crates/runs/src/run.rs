@@ -190,6 +190,11 @@ impl Run {
             return Err(RunError::setting("budget", budget, message));
         }
         folder.write_views(&views)?;
+        // With what was changed to resume, should this process die.
+        folder.write_record(&RunRecord {
+            input: request.input.clone(),
+            complete: record.complete,
+        })?;
         Self::new(folder, lock, request, trainer, paces)
     }
 

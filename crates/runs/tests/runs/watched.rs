@@ -87,6 +87,13 @@ fn a_stopped_run_is_saved_and_resumes_to_the_bytes_of_an_uninterrupted_one() {
         error.to_string().starts_with("budget 0.000000001: the run has trained"),
         "{error}"
     );
+    let limited = TrainInput {
+        until_psnr: Some(90.0),
+        ..of_run()
+    };
+    // As if the process died before its first step.
+    drop(Run::resume_on(limited.check().expect("a request"), dataset()).expect("resumed"));
+    assert_eq!(of_run().until_psnr, Some(90.0));
     let mut run = Run::resume_on(of_run().check().expect("a request"), dataset()).expect("resumed");
     run.train(&mut []).expect("trains");
     let finished = run.finish().expect("finishes");

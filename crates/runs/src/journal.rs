@@ -59,7 +59,7 @@ fn open_paces(folder: &RunFolder, from: u64) -> Result<File, RunError> {
 }
 
 impl Journal {
-    /// Begins a journal, or resumes one after step `from`, in which case later events of an interrupted run are removed.
+    /// Begins a journal, or resumes one after step `from`, in which case events of an interrupted run that will be repeated are removed.
     pub fn open(folder: &RunFolder, from: u64) -> Result<Self, RunError> {
         let path = folder.file("events.jsonl");
         let mut journal = Self {
@@ -83,8 +83,10 @@ impl Journal {
             let Ok(value) = serde_json::from_str::<serde_json::Value>(line) else {
                 break;
             };
-            if value["step"].as_u64().is_some_and(|step| step > from) {
-                continue;
+            // Later events belong to steps that are made again, including those without a step of their own; a run that begins again repeats
+            // all.
+            if from == 0 || value["step"].as_u64().is_some_and(|step| step > from) {
+                break;
             }
             journal.restore_event(&value);
             kept.push_str(line);
@@ -275,4 +277,31 @@ pub fn logged_errors(folder: &Path) -> Vec<f64> {
         .filter(|event| event["event"] == "step")
         .filter_map(|event| event["mse"].as_f64())
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn events_of_steps_that_are_made_again_are_removed() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("events.jsonl");
+        let lines = [
+            r#"{"event":"warned","message":"little memory"}"#,
+            r#"{"event":"stage_entered","stage":"warmup","step":0,"seconds":0.0}"#,
+            r#"{"event":"step","step":5,"seconds":1.0,"loss":0.5,"splats":9}"#,
+            r#"{"event":"step","step":6,"seconds":1.2,"loss":0.5,"splats":9}"#,
+            r#"{"event":"warned","message":"of step 6"}"#,
+        ];
+        let resumed = |from: u64| {
+            fs::write(&path, lines.map(|line| format!("{line}\n")).concat()).unwrap();
+            let journal = Journal::open(&RunFolder::at(folder.path()), from).unwrap();
+            let kept = fs::read_to_string(&path).unwrap().lines().count();
+            (kept, journal.warnings, journal.stages.len(), journal.curve.len())
+        };
+        assert_eq!(resumed(5), (3, vec!["little memory".to_owned()], 1, 1));
+        // They are reported again by the run that begins again.
+        assert_eq!(resumed(0), (0, Vec::new(), 0, 0));
+    }
 }

@@ -96,7 +96,7 @@ pub use pose::{
 pub use protocol::Protocol;
 pub use provenance::{data_fingerprint, program_fingerprint};
 pub use reading::{Reading, ReadingOptions};
-pub use request::{DEFAULT_RECIPE, HOW_TO_GET_LPIPS, TrainInput, TrainRequest, read_recipe};
+pub use request::{DEFAULT_RECIPE, HOW_TO_GET_LPIPS, TrainInput, TrainRequest, has_perceptual_loss, read_recipe};
 pub use results::write_image;
 pub use run::{Finished, Run, open_device};
 pub use scene_file::{Scene, check_not_overwritten, read_lights, read_vignette, residual_left_out, scene_path};

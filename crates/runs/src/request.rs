@@ -243,7 +243,7 @@ pub fn read_recipe(name: &str, overrides: &[String]) -> Result<Recipe, RunError>
 }
 
 /// Whether the recipe's loss contains LPIPS at any time.
-pub(crate) fn has_perceptual_loss(recipe: &Recipe) -> bool {
+pub fn has_perceptual_loss(recipe: &Recipe) -> bool {
     let has_perceptual_weight = |moment: &OutlinePoint| moment.values[Param::PerceptualWeight] > 0.0;
     outline(recipe, 1000).iter().any(has_perceptual_weight)
 }
@@ -313,7 +313,7 @@ impl TrainRequest {
         let missing = self.input.lpips.is_none() && has_perceptual_loss(&self.recipe);
         let line = || {
             format!(
-                "recipe {} is trained without its perceptual loss: no LPIPS weights found; {HOW_TO_GET_LPIPS}",
+                "recipe {} is trained without its perceptual loss: the run has no LPIPS weights; {HOW_TO_GET_LPIPS}",
                 self.recipe.name
             )
         };

@@ -14,7 +14,8 @@ use irradia_compute::DeviceChoice;
 use irradia_runs::scene::Dataset;
 use irradia_runs::{
     Background, DEFAULT_RECIPE, Finished, NOT_MEASURED, PoseCheck, PoseSource, Reading, Run, RunError, RunFolder,
-    TrainInput, TrainRequest, check_poses, moved_from_dataset, pose_source, scene_path,
+    TrainInput, TrainRequest, check_poses, has_perceptual_loss, moved_from_dataset, pose_source, read_recipe,
+    scene_path,
 };
 use irradia_train::event::Observer;
 use std::path::{Path, PathBuf};
@@ -216,15 +217,26 @@ fn with_local_settings(args: &Args, mut input: TrainInput) -> Result<TrainInput>
     input.reading.images = args.reading.images.clone().or(input.reading.images);
     input.memory = args.memory.or(input.memory);
     input.device = args.device.clone().unwrap_or(input.device);
-    input.lpips = resolve_lpips(input.lpips, args)?;
+    input.lpips = resolve_lpips(&input, args)?;
     input.unseen_lpips = input.unseen_lpips.filter(|path| path.exists());
     Ok(input)
 }
 
-/// The weights with which a run began, if they still exist: without them a perceptual loss would be skipped.
-fn resolve_lpips(kept: Option<PathBuf>, args: &Args) -> Result<Option<PathBuf>> {
-    let kept = kept.filter(|path| path.exists());
-    lpips_path(args.lpips.as_ref().or(kept.as_ref()))
+/// The given weights, else those with which the run of `input` began. Weights that only measure may be others by now, but a perceptual loss
+/// must not begin with the next step, or change its network.
+fn resolve_lpips(input: &TrainInput, args: &Args) -> Result<Option<PathBuf>> {
+    let kept = input.lpips.as_ref().filter(|path| path.exists());
+    let given = args.lpips.as_ref().or(kept);
+    if given.is_none() && has_perceptual_loss(&read_recipe(&input.recipe, &[])?) {
+        if let Some(gone) = &input.lpips {
+            let gone = gone.display();
+            warn(&[format!(
+                "{gone}, the LPIPS weights of the run's loss, are gone: name their new place with --lpips"
+            )]);
+        }
+        return Ok(None);
+    }
+    lpips_path(given)
 }
 
 /// The input of a new run.

@@ -55,6 +55,7 @@ fn weights_are_imported_found_and_named() {
     );
     irradia(here, "eval run --data data --lpips-net alex").refused(2, &["lpips_alex.safetensors", "--import"]);
 
+    irradia(here, "train data --recipe curriculum --steps 2 --out without").success();
     for weights in [&squeeze, &alex] {
         publish(weights, here);
         irradia(here, "lpips --import features.pth heads.pth").success();
@@ -73,6 +74,11 @@ fn weights_are_imported_found_and_named() {
             "{name}"
         );
     }
+
+    // A perceptual loss does not begin in the middle of a run.
+    unfinish(&here.join("without"), "scene.ply");
+    let ended = irradia(here, "train --resume without").success();
+    assert!(!ended.stderr.contains("LPIPS of"), "{ended:?}");
 
     let measure = |more: &str| {
         let ended = irradia(here, &format!("eval run --data data --json figures.json {more}")).success();

@@ -1,10 +1,11 @@
 //! Fingerprints of a run's data and of the program, to detect changes.
 
+use crate::is_film_name;
 use irradia_scene::{Dataset, Lens};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-use std::io;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::{fs, io};
 
 /// `views.json`: the views of a run's dataset, by name.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -108,10 +109,60 @@ impl Hash {
     }
 }
 
-/// A hash of the dataset in `root` as training uses it: names, split, sizes, cameras, number of points, and the sizes of the
-/// image files. The pixels are not read.
-pub fn data_fingerprint(dataset: &Dataset, root: &Path) -> String {
+/// Extensions of photographs, masks, and maps of depth and normals.
+const IMAGE_EXTENSIONS: [&str; 11] = [
+    "png", "jpg", "jpeg", "webp", "tif", "tiff", "heic", "heif", "hif", "exr", "npy",
+];
+/// Maximum depth of the search for files, which a link back to a parent would otherwise make endless.
+const MAX_DEPTH: u32 = 6;
+
+/// A hash of the data in `folders`, the dataset's and those of photographs elsewhere, as training uses it: names and sizes of all photographs,
+/// masks, maps and films, and, if they have poses, names, split, sizes, cameras and number of points of `dataset`. The pixels are not read.
+pub fn data_fingerprint(dataset: Option<&Dataset>, folders: &[&Path]) -> String {
     let mut hash = Hash::new();
+    for folder in folders {
+        let mut files = Vec::new();
+        add_files(folder, MAX_DEPTH, &mut files);
+        files.sort();
+        for (path, bytes) in files {
+            hash.add(
+                path.strip_prefix(folder)
+                    .unwrap_or(&path)
+                    .as_os_str()
+                    .as_encoded_bytes(),
+            );
+            hash.add(&bytes.to_le_bytes());
+        }
+    }
+    if let Some(dataset) = dataset {
+        add_dataset(&mut hash, dataset);
+    }
+    hash.hex()
+}
+
+/// Adds the images and films at `path`, or below it and outside the folders of runs, and their sizes.
+fn add_files(path: &Path, depth: u32, files: &mut Vec<(PathBuf, u64)>) {
+    if let Ok(entries) = fs::read_dir(path) {
+        let is_shown = |path: &PathBuf| {
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            !name.starts_with('.') && !path.join("run.json").is_file()
+        };
+        let below = entries.flatten().map(|entry| entry.path()).filter(is_shown);
+        below
+            .filter(|_| depth > 0)
+            .for_each(|path| add_files(&path, depth - 1, files));
+        return;
+    }
+    let extension = path.extension().unwrap_or_default().to_ascii_lowercase();
+    let is_image = IMAGE_EXTENSIONS.iter().any(|image| extension == *image);
+    if (is_image || is_film_name(path))
+        && let Ok(file) = fs::metadata(path)
+    {
+        files.push((path.to_owned(), file.len()));
+    }
+}
+
+fn add_dataset(hash: &mut Hash, dataset: &Dataset) {
     hash.add(&serde_json::to_vec(&ViewList::of(dataset)).expect("plain data"));
     for view in &dataset.views {
         let k = &view.camera.intrinsics;
@@ -125,12 +176,9 @@ pub fn data_fingerprint(dataset: &Dataset, root: &Path) -> String {
         if let Some(shutter) = &view.camera.shutter {
             hash.add(format!("{shutter:?}").as_bytes());
         }
-        let bytes = std::fs::metadata(root.join(&view.name)).map_or(0, |file| file.len());
-        hash.add(&bytes.to_le_bytes());
     }
     let points = dataset.points.as_ref().map_or(0, |points| points.len());
     hash.add(&(points as u64).to_le_bytes());
-    hash.hex()
 }
 
 /// A hash of this program's file, which differs between builds.
@@ -139,7 +187,7 @@ pub fn data_fingerprint(dataset: &Dataset, root: &Path) -> String {
 /// When the file cannot be read.
 pub fn program_fingerprint() -> io::Result<String> {
     let mut hash = Hash::new();
-    hash.add(&std::fs::read(std::env::current_exe()?)?);
+    hash.add(&fs::read(std::env::current_exe()?)?);
     Ok(hash.hex())
 }
 
@@ -155,7 +203,7 @@ mod tests {
         let changed = |change: &dyn Fn(&mut Dataset)| {
             let mut data = data.clone();
             change(&mut data);
-            let fingerprint = |data: &Dataset| data_fingerprint(data, Path::new("."));
+            let fingerprint = |data: &Dataset| data_fingerprint(Some(data), &[]);
             assert_ne!(fingerprint(&data), fingerprint(&self::data()));
             then.differences(&ViewList::of(&data)).join("; ")
         };
@@ -171,6 +219,31 @@ mod tests {
             data.test.push(view);
         });
         assert!(moved.contains("held out"), "{moved}");
+    }
+
+    #[test]
+    fn photographs_masks_and_films_count_wherever_they_are() {
+        let [data, elsewhere] = [(); 2].map(|()| tempfile::tempdir().unwrap());
+        let fingerprint = || data_fingerprint(None, &[data.path(), elsewhere.path()]);
+        let mut known = vec![fingerprint()];
+        for file in ["a.JPG", "masks/a.png", "depths/b/a.npy", "walk.mp4"] {
+            for folder in [&data, &elsewhere] {
+                let path = folder.path().join(file);
+                fs::create_dir_all(path.parent().unwrap()).unwrap();
+                for size in [1, 2] {
+                    fs::write(&path, vec![0; size]).unwrap();
+                    let now = fingerprint();
+                    assert!(!known.contains(&now), "{file} of {size} bytes");
+                    known.push(now);
+                }
+            }
+        }
+        // Notes, and what a run in the folder writes.
+        fs::create_dir_all(data.path().join("run/eval")).unwrap();
+        for file in ["notes.txt", "run/run.json", "run/eval/a.png"] {
+            fs::write(data.path().join(file), "x").unwrap();
+        }
+        assert_eq!(known.last(), Some(&fingerprint()));
     }
 
     fn data() -> Dataset {

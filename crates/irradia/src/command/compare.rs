@@ -3,6 +3,7 @@
 //! Each run is a separate process of this program's `train`, so that memory is measured separately and a failure does not
 //! affect other runs.
 
+use super::lpips::{lpips_path, unseen_lpips_path};
 use super::train::parse_seconds;
 use super::{DataArgs, thread_count, with_option_names};
 use crate::Usage;
@@ -23,6 +24,7 @@ use irradia_runs::{
 };
 use serde::{Deserialize, Serialize};
 use std::fs::{self, File};
+use std::iter;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -111,15 +113,19 @@ struct Request {
     /// Hash of this program's file; empty if an earlier version wrote it.
     #[serde(default)]
     program: String,
-    /// Hash of the dataset; empty if it could not be read, or an earlier version wrote it.
+    /// Hash of the data; empty if an earlier version wrote it.
     #[serde(default)]
     data: String,
+    /// The LPIPS weights found: those of the loss and of the scores, and those that only score.
+    #[serde(default)]
+    lpips: [Option<PathBuf>; 2],
 }
 
 impl Request {
     /// Why a run made for `self` cannot be reused for `wanted`.
     fn mismatch(&self, wanted: &Self) -> Option<&'static str> {
-        let same = (&self.arguments, &self.recipe_hash) == (&wanted.arguments, &wanted.recipe_hash);
+        let same = (&self.arguments, &self.recipe_hash, &self.lpips)
+            == (&wanted.arguments, &wanted.recipe_hash, &wanted.lpips);
         match (same, self.program == wanted.program, self.data == wanted.data) {
             (false, ..) => Some("under other conditions"),
             (true, _, false) => Some("on data that has changed since"),
@@ -135,7 +141,7 @@ struct Source {
     data: PathBuf,
     /// Name of its folder.
     name: String,
-    /// Hash of its content; empty if it cannot be read: its runs then report the error.
+    /// Hash of its content.
     fingerprint: String,
     /// How it is read.
     reading: Reading,
@@ -169,6 +175,7 @@ pub fn run(args: &Args) -> Result<()> {
     }
     let sources = sources(args)?;
     let program = program_fingerprint().context("cannot read this program's file")?;
+    lpips_path(args.lpips.as_ref())?;
     if !args.overwrite {
         check_earlier(args, &program, &variants, &sources)?;
     }
@@ -304,13 +311,20 @@ fn sources(args: &Args) -> Result<Vec<Source>> {
             }
             notes.iter().for_each(note);
         }
+        // The file of a dataset, as of nerfstudio, is beside its photographs.
+        let root = std::path::absolute(data)?;
+        let beside = root.parent().filter(|_| dataset.is_some() && root.is_file());
+        let folders: Vec<&Path> = iter::once(beside.unwrap_or(&root))
+            .chain(reading.images.as_deref())
+            .collect();
+        let fingerprint = data_fingerprint(dataset.as_ref(), &folders);
         Ok(Source {
             published: published_rows,
             notes,
             reading,
             data: data.clone(),
             name,
-            fingerprint: dataset.map_or(String::new(), |dataset| data_fingerprint(&dataset, data)),
+            fingerprint,
         })
     };
     args.data.iter().zip(names).map(source).collect()
@@ -387,7 +401,11 @@ fn request(args: &Args, program: &str, source: &Source, variant: &Variant, seed:
     option("--background", args.background().map(|b| b.to_string()));
     // Published figures were measured with the given poses.
     option("--poses", args.protocol.map(|_| "given".to_owned()));
+    // A folder without weights has been reported before.
+    let lpips = lpips_path(args.lpips.as_ref()).ok().flatten();
+    let unseen_lpips = unseen_lpips_path(args.lpips.as_ref(), lpips.as_ref());
     Request {
+        lpips: [lpips, unseen_lpips],
         arguments,
         recipe_hash: variant.hash.clone(),
         program: program.to_owned(),

@@ -77,6 +77,11 @@ fn a_comparison_summarises_its_runs_and_reuses_finished_ones() {
     fs::copy(folder.path().join("data/train/r_001.png"), &picture).expect("replaced");
     irradia(folder.path(), COMPARE_LINE).refused(2, &["seed_0", "data that has changed since"]);
     fs::write(&picture, bytes).expect("written");
+    let weights = folder.path().join("share/irradia/lpips_alex.safetensors");
+    fs::create_dir_all(weights.parent().expect("a folder")).expect("a folder");
+    fs::write(&weights, "not read").expect("written");
+    irradia(folder.path(), COMPARE_LINE).refused(2, &["seed_0", "other conditions"]);
+    fs::remove_file(&weights).expect("removed");
 
     // Other conditions make another comparison, except with --overwrite.
     let other = COMPARE_LINE.replace("--steps 20", "--steps 21");

@@ -92,23 +92,34 @@ pub(crate) fn cameras_json(trainer: &Trainer) -> Vec<u8> {
     to_json(&records)
 }
 
-/// The file of the cameras of the scene `scene` alone, such as `scene.edited.cameras.json`. It exists if the scene was moved away from the
-/// photographs of its run, and the cameras with it.
+/// The file of the cameras of the scene `scene` alone, such as `scene.edited.ply.cameras.json`. It exists if the scene was moved away from
+/// the photographs of its run, and the cameras with it.
 fn own_cameras_file(scene: &Path) -> PathBuf {
-    scene.with_extension("cameras.json")
+    let mut name = scene.file_name().unwrap_or_default().to_owned();
+    name.push(".cameras.json");
+    scene.with_file_name(name)
+}
+
+/// [`own_cameras_file`], or the file that an earlier version wrote, without the extension of the scene.
+fn existing_own_cameras_file(scene: &Path) -> Option<PathBuf> {
+    let files = [own_cameras_file(scene), scene.with_extension("cameras.json")];
+    files.into_iter().find(|file| file.is_file())
 }
 
 /// Whether the file `scene` was moved away from the photographs of the run whose folder contains it.
 pub fn is_moved(scene: &Path) -> bool {
-    own_cameras_file(scene).is_file()
+    existing_own_cameras_file(scene).is_some()
 }
 
 /// How the whole scene in the file `scene` was moved away from the photographs of the run whose folder contains it, in the dataset's
 /// coordinates: by its own cameras and those of the run.
 pub fn moved_from_run(scene: &Path) -> Transform {
     let of_run = camera_records(&scene.with_file_name(CAMERAS)).unwrap_or_default();
-    let own = camera_records(&own_cameras_file(scene)).unwrap_or_default();
-    let same = of_run.iter().zip(&own).filter(|(a, b)| a.name == b.name);
+    let own = existing_own_cameras_file(scene).and_then(|file| camera_records(&file));
+    let same = of_run
+        .iter()
+        .zip(own.iter().flatten())
+        .filter(|(a, b)| a.name == b.name);
     moved_between(&same.map(|(a, b)| [a.placed(), b.placed()]).collect::<Vec<_>>())
 }
 
@@ -215,11 +226,7 @@ fn camera_records(file: &Path) -> Option<Vec<CameraRecord>> {
 
 /// The file of the cameras of `scene`.
 fn cameras_file(scene: &Path) -> PathBuf {
-    if is_moved(scene) {
-        own_cameras_file(scene)
-    } else {
-        scene.with_file_name(CAMERAS)
-    }
+    existing_own_cameras_file(scene).unwrap_or_else(|| scene.with_file_name(CAMERAS))
 }
 
 /// Writes the cameras of the scene `to`, in the folder of a run: those of `from`, after moving the whole scene in the dataset's coordinates.
@@ -228,13 +235,14 @@ fn cameras_file(scene: &Path) -> PathBuf {
 /// # Errors
 /// When the file cannot be written or removed.
 pub fn write_own_cameras(from: &Path, to: &Path, moved: &Transform) -> Result<(), RunError> {
-    let file = own_cameras_file(to);
     let is_in_run = to.with_file_name(CAMERAS).is_file();
     let has_own = is_in_run && (is_moved(from) || !moved.is_identity());
     match has_own.then(|| moved_cameras_json(from, moved)).flatten() {
-        Some(text) => Ok(write_atomic(&file, |out| out.write_all(&text))?),
-        None if is_in_run && file.is_file() => fs::remove_file(&file).map_err(RunError::io("remove", &file)),
-        None => Ok(()),
+        Some(text) => Ok(write_atomic(&own_cameras_file(to), |out| out.write_all(&text))?),
+        None => match existing_own_cameras_file(to).filter(|_| is_in_run) {
+            Some(file) => fs::remove_file(&file).map_err(RunError::io("remove", &file)),
+            None => Ok(()),
+        },
     }
 }
 

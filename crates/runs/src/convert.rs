@@ -1,9 +1,10 @@
 //! Conversion of a scene from one splat format to another, and its cost: bytes, splats and, for lossy formats, PSNR.
 
-use crate::cameras::cameras_beside;
+use crate::cameras::{cameras_beside, write_own_cameras};
 use crate::levels::write_scene;
 use crate::orbit::orbit;
 use crate::{RunError, check_not_overwritten, residual_left_out, scene_path};
+use irradia_edit::Transform;
 use irradia_formats::{SplatFormat, WriteOptions, read_splat_file, read_splats, splat_file_size};
 use irradia_measure::psnr;
 use irradia_scene::{GaussianCloud, Similarity};
@@ -47,6 +48,7 @@ pub fn convert(input: &Path, output: &Path, options: &WriteOptions, compares: bo
     let mut notes = file.warnings();
     notes.extend(residual_left_out(&input, "splat formats cannot hold it"));
     notes.extend(write_scene(output, &file.cloud, options)?);
+    write_own_cameras(&input, output, &Transform::IDENTITY)?;
     let is_compared = compares && to.is_readable() && !to.is_lossless();
     Ok(Conversion {
         formats: [file.format, to],

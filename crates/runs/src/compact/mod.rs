@@ -8,10 +8,12 @@
 mod interpolate;
 mod tries;
 
+use crate::cameras::write_own_cameras;
 use crate::evaluate::hold_out_readable;
 use crate::levels::write_scene;
 use crate::{ReadingOptions, RunError, Scene, check_not_overwritten, read_vignette, residual_left_out, scene_path};
 use interpolate::with_interpolated_views;
+use irradia_edit::Transform;
 use irradia_formats::{SplatFormat, WriteOptions, splat_file_size};
 use irradia_train::model::Model;
 use std::path::PathBuf;
@@ -186,6 +188,7 @@ pub fn compact(input: &CompactInput, on_event: &mut dyn FnMut(CompactEvent)) -> 
     }
     let held_out_after = measure.held_out_psnr(&Model::of_splats(&found.splats))?;
     notes.extend(write_scene(&input.out, &tries.cloud(&found.splats), &found.write)?);
+    write_own_cameras(&file, &input.out, &Transform::IDENTITY)?;
     Ok(Compacted {
         formats: [SplatFormat::of(&file)?, format],
         bytes: [splat_file_size(&file)?, splat_file_size(&input.out)?],

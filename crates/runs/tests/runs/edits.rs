@@ -11,7 +11,7 @@ use irradia_runs::train::eval::{EvalOptions, Metrics};
 use irradia_runs::train::event::{Event, Observer, Signal};
 use irradia_runs::train::half_fit::HalfFit;
 use irradia_runs::train::schedule::plan;
-use irradia_runs::{EDITS, Editing, ReadingOptions};
+use irradia_runs::{EDITS, Editing, ReadingOptions, convert, is_moved};
 use irradia_splat::logit;
 use serde_json::Value;
 use std::fs;
@@ -292,6 +292,17 @@ fn cameras_follow_moved_scenes_and_splats_are_not_trained_on_other_poses() {
         assert!(error.contains("moved away"), "{error}");
     }
     drop(begin_from("run").expect("a run"));
+    // Cameras come along to another file, and those of another format of the same name are its own.
+    let (up, copy) = (here("run/up.ply"), here("run/copy.ply"));
+    convert(&up, &copy, &WriteOptions::default(), false).expect("converts");
+    edited(&here("run"), &["opacity factor=0.9"])
+        .write(&here("run/up.spz"), &WriteOptions::default())
+        .expect("writes");
+    assert!(is_moved(&copy) && is_moved(&up) && !is_moved(&here("run/up.spz")));
+    assert_eq!(
+        psnr("run/copy.ply").expect("photographs"),
+        psnr("run/up.ply").expect("photographs")
+    );
 
     // Each photograph gets the pose of another.
     let path = here("photos/transforms_train.json");

@@ -55,13 +55,14 @@ pub fn level_file(path: &Path, level: u32) -> Result<PathBuf, RunError> {
 
 /// Writes a scene like [`write_splats_with`], and removes the levels beside it, which belong to the scene that it replaces.
 pub(crate) fn write_scene(path: &Path, cloud: &GaussianCloud, options: &WriteOptions) -> Result<Vec<String>, RunError> {
+    let notes = write_splats_with(path, cloud, options)?;
     for level in 1..=LEVELS {
         let Ok(file) = level_file(path, level) else { break };
         if file.is_file() {
             fs::remove_file(&file).map_err(RunError::io("remove", &file))?;
         }
     }
-    Ok(write_splats_with(path, cloud, options)?)
+    Ok(notes)
 }
 
 /// Writes the levels of the scene `input` beside `output`, and compares them in views of its training cameras.
@@ -159,6 +160,7 @@ fn compared_cameras(input: &Path, cloud: &GaussianCloud, splats: &Splats) -> Vec
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::convert;
     use irradia_formats::write_splats;
     use irradia_scene::Rng;
 
@@ -194,6 +196,13 @@ mod tests {
         let read = read_levels(&path, count).unwrap();
         assert_eq!(read.iter().map(Splats::len).collect::<Vec<_>>(), [1000, 500, 250]);
         assert!(read_levels(&path, 10 * count).unwrap().is_empty(), "of another scene");
+        // A level does not replace its scene, whose other levels would be lost.
+        let level = &levels[1].path;
+        let error = convert(level, &path, &WriteOptions::default(), false).unwrap_err();
+        assert!(
+            error.to_string().contains("would be replaced") && level.is_file(),
+            "{error}"
+        );
         assert!(read_levels(&folder.path().join("b.ply"), count).unwrap().is_empty());
     }
 }

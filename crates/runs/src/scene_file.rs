@@ -2,6 +2,7 @@
 
 use crate::cameras::cameras_beside;
 use crate::folder::{APPEARANCE, EXPOSURES, FIELD, RESIDUAL, SCENE, SKY, VIGNETTE, world_beside};
+use crate::levels::{LEVELS, level_file};
 use crate::orbit::{OrbitGeometry, orbit, orbit_geometry};
 use crate::{RunError, RunFolder};
 use irradia_edit::Draft;
@@ -121,12 +122,17 @@ pub fn scene_path(path: &Path) -> PathBuf {
 /// Rejects an output that would replace the input scene.
 ///
 /// # Errors
-/// When `output` is `scene`, or the scene's file in that folder.
+/// When `output` is `scene`, or the scene's file in that folder, or `scene` is a level of detail of `output`.
 pub fn check_not_overwritten(scene: &Path, output: &Path) -> Result<(), RunError> {
     let scene = scene_path(scene);
     // A folder of SOG images is written as its list.
     let list = output.join(SplatFormat::SogFolder.suffix());
-    if same_file(output, &scene) || same_file(&list, &scene) {
+    let levels = (1..=LEVELS).map_while(|level| level_file(output, level).ok());
+    if [output.to_owned(), list]
+        .into_iter()
+        .chain(levels)
+        .any(|file| same_file(&file, &scene))
+    {
         Err(RunError::Refused(format!(
             "{} would be replaced: name another output",
             scene.display()

@@ -173,6 +173,10 @@ fn begin_events(trainer: &mut Trainer) -> Vec<Event> {
             step: 0,
             seconds: 0.0,
         });
+    } else if trainer.memory.splats < trainer.recipe.max_splats {
+        // Resumed with less memory than that with which the recipe got its limit.
+        let warning = trainer.memory.warning(&trainer.recipe.name);
+        events.extend(warning.map(|message| Event::Warned { message }));
     }
     events
 }
@@ -332,8 +336,10 @@ fn held_out_psnr(trainer: &Trainer, views: &[usize], observers: &[&mut dyn Obser
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::checkpoint::{from_bytes, to_bytes};
     use crate::conditions::tests::dataset;
     use crate::{Recipe, TrainOptions};
+    use irradia_splat::Splats;
 
     /// What was decided.
     #[derive(Default)]
@@ -364,6 +370,29 @@ mod tests {
             "{:?}",
             log.0
         );
+    }
+
+    #[test]
+    fn a_limit_by_memory_stays_and_a_lower_one_is_reported_when_a_run_resumes() {
+        let set = ["max_splats=1000000".to_owned()];
+        let recipe = Recipe::parse("classic", Recipe::built_in("classic").unwrap(), &set).unwrap();
+        let options = |mebibytes: usize| TrainOptions {
+            memory: Some(mebibytes << 20),
+            ..TrainOptions::default()
+        };
+        let splats = Splats::zeros(4, 0);
+        let mut trainer = Trainer::from_splats(dataset(3, true), recipe, options(80), splats).unwrap();
+        let limit = trainer.recipe.max_splats;
+        assert!(limit == trainer.memory.splats && limit < 1_000_000, "{limit}");
+        trainer.clock.step = 7;
+        let bytes = to_bytes(&trainer);
+        for (mebibytes, is_reported) in [(70, true), (80, false), (100, false)] {
+            let mut resumed = from_bytes(&bytes, dataset(3, true), options(mebibytes)).unwrap();
+            let events = begin_events(&mut resumed);
+            let is_warned = events.iter().any(|event| matches!(event, Event::Warned { .. }));
+            assert_eq!(is_warned, is_reported, "{mebibytes} MiB");
+            assert_eq!(resumed.cap < limit, is_reported);
+        }
     }
 
     #[test]

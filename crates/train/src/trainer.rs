@@ -184,10 +184,7 @@ impl Trainer {
     pub fn new(dataset: Arc<Dataset>, recipe: Recipe, options: TrainOptions) -> Result<Self, TrainError> {
         let first = first_count(&dataset, &recipe);
         let mut trainer = Self::with_empty_state(dataset, recipe, options, first)?;
-        if trainer.memory.splats < trainer.memory.wanted_splats {
-            // Stored in the recipe, so that a resumed run has the same limit.
-            trainer.recipe.max_splats = trainer.memory.splats;
-        }
+        trainer.keep_memory_limit();
         trainer.apply_data_conditions()?;
         if is_field(&trainer.recipe, 0) {
             let state = trainer.first_field()?;
@@ -217,6 +214,7 @@ impl Trainer {
         // In the recipe, so that forecasts, the report and a resumed run have the same bands.
         recipe.keep_sh_bands(splats.used_sh_degree());
         let mut trainer = Self::with_empty_state(dataset, recipe, options, splats.len())?;
+        trainer.keep_memory_limit();
         trainer.apply_data_conditions()?;
         *trainer.engine.state_mut() = SplatState::new(splats);
         trainer.sockets = trainer.first_sockets()?;
@@ -290,6 +288,13 @@ impl Trainer {
             dataset,
             options,
         })
+    }
+
+    /// Stores a limit by memory in the recipe, so that a resumed run has the same limit.
+    fn keep_memory_limit(&mut self) {
+        if self.memory.splats < self.memory.wanted_splats {
+            self.recipe.max_splats = self.memory.splats;
+        }
     }
 
     /// The recipe's field, untrained.

@@ -44,13 +44,16 @@ pub(crate) const VIEWS: &str = "views.json";
 const WORLD: &str = "world.json";
 /// The pace of each step.
 pub(crate) const PACES: &str = "pace.txt";
+/// The paces that the run repeats, a copy of those of another run, which may be moved before this one is resumed.
+pub(crate) const REPEATED_PACES: &str = "replay.txt";
 
 /// The files of a run other than those of [`socket::FILES`].
-const FILES: [&str; 16] = [
+const FILES: [&str; 17] = [
     "run.json",
     VIEWS,
     WORLD,
     PACES,
+    REPEATED_PACES,
     "recipe.toml",
     CAMERAS,
     "events.jsonl",
@@ -73,7 +76,7 @@ fn all_files() -> impl Iterator<Item = &'static str> {
 const SUBFOLDERS: [&str; 2] = ["eval", "checkpoints"];
 
 /// Files written before `run.json`; a run has begun once `run.json` exists.
-const FILES_BEFORE_RECORD: [&str; 4] = ["recipe.toml", CAMERAS, VIEWS, WORLD];
+const FILES_BEFORE_RECORD: [&str; 5] = ["recipe.toml", CAMERAS, VIEWS, WORLD, REPEATED_PACES];
 
 /// Whether the folder `path` contains a run, or may contain one. False if it contains only files of a process that died before
 /// its run had begun.
@@ -308,9 +311,16 @@ impl RunFolder {
     /// # Errors
     /// When the run has no recorded paces, or the file is damaged.
     pub(crate) fn paces(&self) -> Result<Paces, RunError> {
-        let path = self.file(PACES);
-        let text = fs::read_to_string(&path).map_err(RunError::io("read", &path))?;
-        Paces::parse(&text).map_err(|reason| RunError::Damaged { path, reason })
+        read_paces(self.file(PACES))
+    }
+
+    /// The paces that the run repeats, if it has begun with a copy of them.
+    ///
+    /// # Errors
+    /// When the file is damaged.
+    pub(crate) fn repeated_paces(&self) -> Result<Option<Paces>, RunError> {
+        let path = self.file(REPEATED_PACES);
+        path.is_file().then(|| read_paces(path)).transpose()
     }
 
     /// Removes the temporary files that a killed process left; requires the folder's lock.
@@ -438,6 +448,12 @@ impl RunFolder {
         }
         Ok(name)
     }
+}
+
+/// The paces in a file.
+fn read_paces(path: PathBuf) -> Result<Paces, RunError> {
+    let text = fs::read_to_string(&path).map_err(RunError::io("read", &path))?;
+    Paces::parse(&text).map_err(|reason| RunError::Damaged { path, reason })
 }
 
 /// Serialisable data as indented JSON.

@@ -1,7 +1,7 @@
 //! A training run with its folder: begin or resume, train, finish.
 
 use crate::evaluate::hold_out_readable;
-use crate::folder::RunRecord;
+use crate::folder::{REPEATED_PACES, RunRecord};
 use crate::journal::Journal;
 use crate::lock::FolderLock;
 use crate::provenance::ViewList;
@@ -112,6 +112,9 @@ impl Run {
         folder.write_cameras(&trainer)?;
         folder.write_views(&views)?;
         folder.write_world(&trainer.dataset.world_from_dataset)?;
+        if let Some(paces) = &paces {
+            folder.write(REPEATED_PACES, paces.to_text().as_bytes())?;
+        }
         // Last: a folder with this file has everything needed to resume.
         folder.write_record(&RunRecord {
             input: request.input.clone(),
@@ -146,7 +149,11 @@ impl Run {
         folder.remove_leftovers()?;
         let options = train_options(&request)?;
         hold_out_readable(&mut dataset);
-        let paces = request.paces()?;
+        let paces = match folder.repeated_paces()? {
+            // Begun by an earlier version.
+            None => request.paces()?,
+            copied => copied,
+        };
         // The world in which the previous steps were made; an earlier version may have chosen another one.
         let (dataset, _) = request.with_points(dataset.in_world(folder.world_from_dataset()?));
         let dataset = Arc::new(dataset);

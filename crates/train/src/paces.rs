@@ -33,6 +33,11 @@ impl Paces {
         format!("{step} {pace}\n")
     }
 
+    /// All lines.
+    pub fn to_text(&self) -> String {
+        self.0.iter().map(|(step, pace)| Self::line(*step, *pace)).collect()
+    }
+
     /// The pace of `step`, counted from 1; after the last pair, the pace of that pair.
     pub(crate) fn at(&self, step: u64) -> Option<f64> {
         let next = self.0.partition_point(|(first, _)| *first <= step);
@@ -49,6 +54,7 @@ mod tests {
         let (third, tiny) = (1.0 / 3.0, f64::MIN_POSITIVE);
         let text = Paces::line(1, third) + &Paces::line(4, tiny) + &Paces::line(9, 1e300) + "12 0.5";
         let paces = Paces::parse(&text).unwrap();
+        assert_eq!(Paces::parse(&paces.to_text()).as_ref(), Ok(&paces));
         let at = [1, 3, 4, 8, 9, 5000].map(|step| paces.at(step).unwrap());
         assert_eq!(at, [third, third, tiny, tiny, 1e300, 1e300]);
         for wrong in [

@@ -183,12 +183,14 @@ fn a_run_with_a_budget_is_repeated_bit_for_bit() {
     assert!(paces(&run).lines().count() > 10);
     let recipe = |run: &Path| std::fs::read_to_string(run.join("recipe.toml")).expect("a recipe");
     assert_eq!(recipe(&run), recipe(&again), "with the background that was set");
-    // An interrupted repetition resumes as one.
+    // An interrupted repetition resumes as one, wherever the original is.
     unfinish(&again, "scene.ply");
+    let moved = folder.path().join("moved");
+    std::fs::rename(&run, &moved).expect("moved");
     irradia(folder.path(), "train --resume again").success();
-    assert!(scene(&run) == scene(&again));
-    std::fs::remove_file(run.join("pace.txt")).expect("removed");
-    irradia(folder.path(), "train --replay run --out x").refused(1, &["run/pace.txt"]);
+    assert!(scene(&moved) == scene(&again));
+    std::fs::remove_file(moved.join("pace.txt")).expect("removed");
+    irradia(folder.path(), "train --replay moved --out x").refused(1, &["moved/pace.txt"]);
     assert!(!folder.path().join("x").exists());
 }
 

@@ -1,7 +1,7 @@
 //! `irradia compact`
 
 use super::convert::QualityArg;
-use super::share::parse_size;
+use super::size::file_size;
 use super::{DataArgs, data_for, note_lines, size_line, thread_count, use_threads, with_option_names};
 use crate::terminal::{note, print_line};
 use anyhow::Result;
@@ -45,7 +45,7 @@ pub struct Args {
 /// `5MB`, `800kB`: bytes; `200k`, `1.5M`, `50000`: splats.
 fn parse_target(text: &str) -> Result<CompactTarget, String> {
     let is_bytes = text.to_lowercase().ends_with('b');
-    match parse_size(text) {
+    match file_size(text) {
         Ok(bytes) if is_bytes => Ok(CompactTarget::Bytes(bytes)),
         Ok(count) => Ok(CompactTarget::Splats(count as usize)),
         Err(_) => Err("expected bytes such as 5MB, or splats such as 200k".into()),

@@ -18,6 +18,7 @@ pub mod recipe;
 mod recipe_keys;
 pub mod render;
 pub mod share;
+mod size;
 pub mod train;
 pub mod view;
 

@@ -1,6 +1,7 @@
 //! `irradia share`
 
 use super::render::film_from_path;
+use super::size::file_size;
 use super::warn;
 use crate::Usage;
 use crate::terminal::print_line;
@@ -24,7 +25,7 @@ pub struct Args {
     #[arg(long, default_value = "")]
     pub credits: String,
     /// Largest size of the page, such as 10MB or 800kB: harmonics are left out first, then splats are merged
-    #[arg(long, value_name = "SIZE", value_parser = parse_size)]
+    #[arg(long, value_name = "SIZE", value_parser = file_size)]
     pub max: Option<u64>,
     /// A camera path, played until the page is touched: a file that the viewer or nerfstudio saved, or orbit, spiral or training
     /// (through the cameras)
@@ -33,23 +34,6 @@ pub struct Args {
     /// Write a folder for a web server: page, scene and start picture
     #[arg(long)]
     pub folder: bool,
-}
-
-/// Bytes of `10MB`, `800kB`, `1.5GB` or `4096`.
-pub(super) fn parse_size(text: &str) -> Result<u64, String> {
-    let end = text
-        .find(|c: char| !(c.is_ascii_digit() || c == '.'))
-        .unwrap_or(text.len());
-    let (number, unit) = text.split_at(end);
-    let factor = match unit.to_lowercase().as_str() {
-        "" | "b" => 1.0,
-        "k" | "kb" => 1e3,
-        "m" | "mb" => 1e6,
-        "g" | "gb" => 1e9,
-        _ => return Err("expected a size such as 10MB or 800kB".into()),
-    };
-    let number: f64 = number.parse().map_err(|_| "expected a size such as 10MB or 800kB")?;
-    Ok((number * factor) as u64)
 }
 
 /// Frames of a flight that is not read from a file: ten seconds.
@@ -140,22 +124,4 @@ pub fn run(args: &Args) -> Result<()> {
         args.out.display(),
         shared.bytes as f64 / 1e6
     ))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn sizes_have_units_of_a_thousand() {
-        for (text, bytes) in [
-            ("10MB", 10_000_000),
-            ("800kB", 800_000),
-            ("1.5g", 1_500_000_000),
-            ("4096", 4096),
-        ] {
-            assert_eq!(parse_size(text), Ok(bytes));
-        }
-        assert!(parse_size("ten").is_err() && parse_size("10 apples").is_err() && parse_size("").is_err());
-    }
 }

@@ -3,6 +3,7 @@
 use super::lpips::{self, lpips_path, unseen_lpips_path};
 use super::pose::{Poses, is_unposed, pose_again, pose_first};
 use super::progress::{Progress, format_size};
+use super::size::memory_size;
 use super::view::ListenArgs;
 use super::{DataArgs, thread_count, use_threads, warn, with_option_names};
 use crate::Usage;
@@ -58,7 +59,7 @@ pub struct Args {
     pub max_splats: Option<usize>,
     /// Memory of the process, such as 8GiB; three quarters of what is free when absent. Photographs that do not fit are read again
     /// when they are needed; splats that do not fit are not added
-    #[arg(long, value_name = "SIZE", value_parser = parse_bytes)]
+    #[arg(long, value_name = "SIZE", value_parser = memory_size)]
     pub memory: Option<usize>,
     /// Random seed
     #[arg(long, value_name = "N", default_value_t = 0, conflicts_with = "resume")]
@@ -134,29 +135,6 @@ impl Args {
     /// Where to serve a viewer, if one is requested.
     fn viewer(&self) -> Option<&ListenArgs> {
         (self.view || self.listen.open).then_some(&self.listen)
-    }
-}
-
-/// `8GiB`, `8G`, `512MiB`, `512M` or a number of bytes.
-pub fn parse_bytes(text: &str) -> Result<usize, String> {
-    let units = [
-        ("KiB", 10),
-        ("MiB", 20),
-        ("GiB", 30),
-        ("TiB", 40),
-        ("K", 10),
-        ("M", 20),
-        ("G", 30),
-        ("T", 40),
-        ("", 0),
-    ];
-    let found = units
-        .iter()
-        .find_map(|(unit, power)| Some((text.strip_suffix(unit)?, *power)));
-    let (number, power) = found.expect("the last unit is empty");
-    match number.trim().parse::<f64>() {
-        Ok(value) if value > 0.0 && value.is_finite() => Ok((value * f64::from(power).exp2()) as usize),
-        _ => Err("expected a size such as 8GiB or 512MiB".into()),
     }
 }
 

@@ -486,6 +486,24 @@ fn a_photograph_that_was_turned_on_the_spot_joins_the_others() {
 }
 
 #[test]
+fn a_photograph_that_is_registered_and_removed_again_and_again_is_given_up() {
+    let mut world = World::new(around(8, 0.5), 400, 0.2, 0.0, 3);
+    let mut rng = Rng::new(3, 9);
+    // Near enough to be registered, but too far from its points to keep them.
+    for keypoint in &mut world.features[4].keypoints {
+        let (y, x) = rng.range(0.0, std::f32::consts::TAU).sin_cos();
+        (keypoint.x, keypoint.y) = (keypoint.x + 4.0 * x, keypoint.y + 4.0 * y);
+    }
+    let options = MapOptions {
+        max_error: 1.0,
+        ..MapOptions::default()
+    };
+    let result = reconstruct(&world.photos, &world.features, &world.pairs, &options, &mut |_| ());
+    assert_eq!(result.registered(), 7);
+    assert!(matches!(&result.left_out[..], [left] if matches!(left.reason, Reason::NotRegistered { .. })));
+}
+
+#[test]
 fn too_little_has_one_clear_outcome() {
     let none = reconstruct(&[], &[], &[], &MapOptions::default(), &mut |_| ());
     assert_eq!(none, Reconstruction::default());

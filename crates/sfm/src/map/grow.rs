@@ -62,7 +62,7 @@ pub(super) fn grow_model<'a>(
     // Whether the model must also explain enough observations.
     let is_doubtful = |model: &GrowingModel| guessed_focals || few || model.is_far_from_initial_focals();
     let mut is_any_doubtful = guessed_focals || few;
-    let mut best: Option<(GrowingModel, Vec<usize>)> = None;
+    let mut best: Option<GrowingModel> = None;
     let mut outcomes: Vec<SeedOutcome> = Vec::new();
     let mut seeds_left = MAX_SEEDS;
     for seed in seeds(pairs, assigned, MAX_SEED_CANDIDATES) {
@@ -81,13 +81,12 @@ pub(super) fn grow_model<'a>(
         let reachable = reachable(&pairs[seed], pairs, assigned);
         if best
             .as_ref()
-            .is_some_and(|(best, _)| best.registered() >= reachable && !is_doubtful(best))
+            .is_some_and(|best| best.registered() >= reachable && !is_doubtful(best))
         {
             continue;
         }
         let mut grown = empty.clone();
-        let mut failures = vec![0; photos.len()];
-        if !grown.initialize(&pairs[seed]) || !grown.grow(assigned, &mut failures, progress) {
+        if !grown.initialize(&pairs[seed]) || !grown.grow(assigned, progress) {
             continue;
         }
         // If photographs were cropped off centre, no seed explains more while principal points are held at the centre: fox, with each
@@ -96,7 +95,7 @@ pub(super) fn grow_model<'a>(
             let mut free = grown.clone();
             free.free_principal_points();
             free.refine_fully(progress);
-            free.grow(assigned, &mut failures, progress);
+            free.grow(assigned, progress);
             if free.explained_fraction() > MIN_EXPLAINED_FRACTION && free.registered() >= grown.registered() {
                 grown = free;
             }
@@ -111,21 +110,20 @@ pub(super) fn grow_model<'a>(
                 model.registered()
             }
         };
-        if grown.registered() >= options.min_model_photos
-            && best.as_ref().is_none_or(|(best, _)| size(&grown) > size(best))
+        if grown.registered() >= options.min_model_photos && best.as_ref().is_none_or(|best| size(&grown) > size(best))
         {
-            best = Some((grown, failures));
+            best = Some(grown);
         }
         let is_sufficient = |best: &GrowingModel| {
             2 * best.registered() > reachable
                 && (!is_doubtful(best) || best.explained_fraction() > MIN_EXPLAINED_FRACTION)
         };
-        if best.as_ref().is_some_and(|(best, _)| is_sufficient(best)) {
+        if best.as_ref().is_some_and(is_sufficient) {
             break;
         }
     }
-    let (best, failures) = best?;
-    for (total, failed) in failed_registrations.iter_mut().zip(failures) {
+    let best = best?;
+    for (total, failed) in failed_registrations.iter_mut().zip(&best.failures) {
         *total += failed;
     }
     Some(best)
@@ -195,30 +193,22 @@ impl GrowingModel<'_> {
     }
 
     /// Registers photographs as long as that succeeds, then adjusts everything; `false` if the model is left with too few photographs.
-    pub(super) fn grow(
-        &mut self,
-        assigned: &[bool],
-        failures: &mut [usize],
-        progress: &mut dyn FnMut(Progress),
-    ) -> bool {
+    pub(super) fn grow(&mut self, assigned: &[bool], progress: &mut dyn FnMut(Progress)) -> bool {
         let (mut photos_then, mut points_then) = (self.registered(), self.point_count());
         let mut refined = false;
         loop {
-            let next = self
-                .registration_candidates(assigned, failures)
-                .into_iter()
-                .find(|photo| {
-                    let registered = self.register(
-                        *photo,
-                        if refined {
-                            LENIENT_INLIER_RATIO
-                        } else {
-                            STRICT_INLIER_RATIO
-                        },
-                    );
-                    failures[*photo] += usize::from(!registered && refined);
-                    registered
-                });
+            let next = self.registration_candidates(assigned).into_iter().find(|photo| {
+                let registered = self.register(
+                    *photo,
+                    if refined {
+                        LENIENT_INLIER_RATIO
+                    } else {
+                        STRICT_INLIER_RATIO
+                    },
+                );
+                self.failures[*photo] += usize::from(!registered && refined);
+                registered
+            });
             let Some(photo) = next else {
                 if refined {
                     break;
@@ -286,9 +276,9 @@ impl GrowingModel<'_> {
     }
 
     /// Photographs to register, best first: those that show many points of the model, spread over the photograph.
-    fn registration_candidates(&self, assigned: &[bool], failures: &[usize]) -> Vec<usize> {
+    fn registration_candidates(&self, assigned: &[bool]) -> Vec<usize> {
         let mut scored: Vec<(usize, usize)> = (0..self.poses.len())
-            .filter(|p| self.poses[*p].is_none() && !assigned[*p] && failures[*p] < MAX_REGISTRATION_ATTEMPTS)
+            .filter(|p| self.poses[*p].is_none() && !assigned[*p] && self.failures[*p] < MAX_REGISTRATION_ATTEMPTS)
             .filter_map(|photo| {
                 let (count, score) = self.visibility(photo);
                 (count >= self.options.min_registration_inliers).then_some((score, photo))

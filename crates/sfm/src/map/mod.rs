@@ -275,10 +275,9 @@ pub fn extend(
     let tracks = Tracks::new(features, &verified);
     let mut growing = model::GrowingModel::new(photos, &cameras, &tracks, options);
     growing.hold(known);
-    let mut failed_registrations = vec![0; photos.len()];
-    growing.grow(&vec![false; photos.len()], &mut failed_registrations, progress);
+    growing.grow(&vec![false; photos.len()], progress);
     let assigned: Vec<bool> = growing.poses.iter().map(Option::is_some).collect();
-    let left_out = finish::left_out(&input, pairs, &assigned, &failed_registrations);
+    let left_out = finish::left_out(&input, pairs, &assigned, &growing.failures);
     let model = finish::extract_model(&growing, photos);
     Reconstruction {
         missing: missing_matches(photos, &model),

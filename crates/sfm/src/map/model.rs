@@ -38,6 +38,8 @@ pub(super) struct GrowingModel<'a> {
     pub points: Vec<Option<DVec3>>,
     /// `[observations]` whether an observation belongs to its track's point.
     pub used: Vec<bool>,
+    /// `[photos]` how often a photograph could not be registered, or was registered and removed.
+    pub failures: Vec<usize>,
 }
 
 impl<'a> GrowingModel<'a> {
@@ -59,6 +61,7 @@ impl<'a> GrowingModel<'a> {
             poses: vec![None; photos.len()],
             points: vec![None; tracks.len()],
             used: vec![false; tracks.observations.len()],
+            failures: vec![0; photos.len()],
         };
         for photo in photos.iter().filter(|photo| photo.camera.is_some()) {
             model.held_cameras[photo.group] = true;
@@ -207,10 +210,13 @@ impl<'a> GrowingModel<'a> {
         self.used[self.tracks.range(track)].fill(false);
     }
 
-    /// Removes the poses of a photograph and of those on its rig, and the points that are then seen less than twice.
+    /// Removes the poses of a photograph and of those on its rig, and the points that are then seen less than twice. This counts as a
+    /// failure: the photograph would be registered with the same pose and removed for ever.
     pub fn deregister(&mut self, photo: usize) {
         for i in 0..self.rigs[photo].len() {
-            self.remove_pose(self.rigs[photo][i]);
+            let removed = self.rigs[photo][i];
+            self.remove_pose(removed);
+            self.failures[removed] += 1;
         }
     }
 

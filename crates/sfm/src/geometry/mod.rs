@@ -11,5 +11,5 @@ pub mod pose;
 pub mod ransac;
 pub mod resection;
 #[cfg(test)]
-mod testing;
+pub(crate) mod testing;
 pub mod triangulate;

@@ -43,7 +43,7 @@ const MAX_SIMILAR_RATIO: f64 = 1.02;
 const MAX_ADJUSTMENT_RATIO: f64 = 3.0;
 /// Maximum number of pairs that vote, those with most inliers.
 const MAX_VOTING_PAIRS: usize = 40;
-/// Number of pairs from which the voting ones are selected when all photographs have metadata.
+/// Number of pairs of photographs with metadata from which the voting ones are selected.
 pub(super) const MAX_CHECKED_PAIRS: usize = 120;
 /// Maximum number of points of each pair that votes.
 const MAX_VOTING_POINTS: usize = 300;

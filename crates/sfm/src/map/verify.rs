@@ -8,7 +8,7 @@ use crate::geometry::correspondences::{Correspondences, sampson_squared};
 use crate::geometry::essential::{Essential, Motion, closest_essential, cross_matrix, motion_in_front, refine_motion};
 use crate::geometry::fundamental::Fundamental;
 use crate::geometry::homography::{Homography, count_rotation_inliers};
-use crate::geometry::ransac::{Estimate, Limits, estimate};
+use crate::geometry::ransac::{Estimate, Estimator, Limits, estimate, samples_for};
 use crate::matching::{MatchOptions, TwoViewGeometry, match_guided};
 use crate::{Features, PairMatches, median};
 use glam::{DMat3, DVec2, DVec3};
@@ -17,6 +17,8 @@ use rayon::prelude::*;
 /// Maximum number of samples. With 40 % inliers, one of 100 samples of five points has inliers only.
 const MAX_SAMPLES: usize = 600;
 const CONFIDENCE: f64 = 0.9999;
+/// Samples of seven points may be as many as find this fraction of inliers as surely as [`MAX_SAMPLES`] of five points: 4,908 for 96 %.
+const MIN_INLIER_FRACTION: f64 = 0.35;
 /// A homography or a rotation explains a pair if it has at least this fraction of the essential matrix's inliers.
 const MIN_EXPLAINED_FRACTION: f64 = 0.8;
 
@@ -70,15 +72,13 @@ pub(super) fn verify_with(
         pairs,
         options,
     } = *unverified;
-    // If all photographs have metadata, a few pairs suffice to check them.
-    let known = photos.iter().all(|p| p.focal_prior_px.is_some());
-    let mut by_match_count: Vec<usize> = (0..pairs.len()).collect();
-    by_match_count.sort_by_key(|i| (std::cmp::Reverse(pairs[*i].matches.len()), *i));
-    let mut is_checked = vec![!known; pairs.len()];
-    by_match_count
-        .iter()
-        .take(focal::MAX_CHECKED_PAIRS)
-        .for_each(|i| is_checked[*i] = true);
+    let is_known = |photo: &u32| {
+        let photo = &photos[*photo as usize];
+        let given = given.get(photo.group).copied().flatten();
+        photo.focal_prior_px.is_some() || given.is_some_and(|camera| camera.source == FocalSource::Prior)
+    };
+    let known: Vec<bool> = pairs.iter().map(|pair| pair.photos.iter().all(is_known)).collect();
+    let is_checked = checked_pairs(pairs, &known);
     let uncalibrated: Vec<Option<UncalibratedPair>> = pairs
         .par_iter()
         .enumerate()
@@ -97,7 +97,8 @@ pub(super) fn verify_with(
     let verified: Vec<VerifiedPair> = pairs
         .par_iter()
         .zip(&uncalibrated)
-        .filter_map(|(pair, uncalibrated)| {
+        .zip(&known)
+        .filter_map(|((pair, uncalibrated), known)| {
             // Without a common epipolar geometry there is no calibrated one either.
             if pair.matches.len() < options.min_inliers || (!known && uncalibrated.is_none()) {
                 return None;
@@ -110,6 +111,28 @@ pub(super) fn verify_with(
         total: pairs.len(),
     });
     (cameras, verified)
+}
+
+/// `[pairs]` whether the fundamental matrix of each is estimated: not where the focal lengths of both photographs are `known`, except for
+/// a few pairs, which suffice to check these.
+fn checked_pairs(pairs: &[PairMatches], known: &[bool]) -> Vec<bool> {
+    let mut is_checked: Vec<bool> = known.iter().map(|known| !known).collect();
+    let mut by_match_count: Vec<usize> = (0..pairs.len()).filter(|i| known[*i]).collect();
+    by_match_count.sort_by_key(|i| (std::cmp::Reverse(pairs[*i].matches.len()), *i));
+    by_match_count
+        .iter()
+        .take(focal::MAX_CHECKED_PAIRS)
+        .for_each(|i| is_checked[*i] = true);
+    is_checked
+}
+
+/// Maximum number of samples of seven of the matches of a pair. A pair of few matches needs a large fraction of inliers to be kept, and so
+/// fewer samples.
+fn max_seven_point_samples(matches: usize, options: &MapOptions) -> usize {
+    let five_points = MIN_INLIER_FRACTION.powi(Essential::SAMPLE as i32);
+    let confidence = 1.0 - (1.0 - five_points).powi(MAX_SAMPLES as i32);
+    let fraction = MIN_INLIER_FRACTION.max(options.min_inliers as f64 / matches as f64);
+    samples_for(confidence, fraction, Fundamental::SAMPLE).max(MAX_SAMPLES)
 }
 
 pub(super) fn seed_of(pair: &PairMatches) -> u64 {
@@ -149,7 +172,7 @@ fn estimate_fundamental(
     let [a, b] = pair.photos.map(|p| long_side(&photos[p as usize]));
     let threshold = options.max_epipolar_error * 0.5 * (1.0 / a + 1.0 / b);
     let limits = Limits {
-        samples: MAX_SAMPLES,
+        samples: max_seven_point_samples(pair.matches.len(), options),
         confidence: CONFIDENCE,
         seed: seed_of(pair),
     };
@@ -166,7 +189,10 @@ fn estimate_fundamental(
                 threshold,
             },
             Vec::new(),
-            limits,
+            Limits {
+                samples: MAX_SAMPLES,
+                ..limits
+            },
         )?
         .model;
         estimate(
@@ -362,4 +388,68 @@ fn median_angle(motion: &Motion, points: &[[DVec2; 2]]) -> f64 {
         .filter(|p| motion.depths(**p).iter().all(|z| *z > 0.0))
         .map(|[a, b]| (motion.rotation * a.extend(1.0)).angle_between(b.extend(1.0)));
     median(angles.collect()).unwrap_or(0.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Keypoint;
+    use crate::geometry::testing::TwoViews;
+    use irradia_scene::Rng;
+
+    #[test]
+    fn few_pairs_of_known_focal_lengths_are_checked_beside_all_others() {
+        let pair = |i: u32| PairMatches {
+            photos: [0, i + 1],
+            matches: vec![[0, 0]; i as usize],
+        };
+        let pairs: Vec<PairMatches> = (0..200).map(pair).collect();
+        let known: Vec<bool> = (0..200).map(|i| i % 4 > 0).collect();
+        let is_checked = checked_pairs(&pairs, &known);
+        // All 50 that are not known, and the 120 with most matches of the others.
+        assert_eq!(is_checked.iter().filter(|checked| **checked).count(), 170);
+        assert!((0..200).all(|i| is_checked[i] == (!known[i] || i >= 40)));
+    }
+
+    #[test]
+    fn a_pair_with_few_inliers_is_found_among_seven_points() {
+        let found = |seed: u64| {
+            let views = TwoViews::new(seed, 100, 3e-4);
+            let mut rng = Rng::new(seed, 9);
+            let mut outlier = || DVec2::new(f64::from(rng.range(-0.5, 0.5)), f64::from(rng.range(-0.5, 0.5)));
+            let points = views.points.iter().enumerate();
+            let points: Vec<[DVec2; 2]> = points
+                .map(|(i, [a, b])| [*a, if i < 35 { *b } else { outlier() }])
+                .collect();
+            let keypoint = |at: DVec2| Keypoint {
+                x: (500.0 + 1000.0 * at.x) as f32,
+                y: (500.0 + 1000.0 * at.y) as f32,
+                scale: 2.0,
+                angle: 0.0,
+            };
+            let features = [0, 1].map(|side| Features {
+                keypoints: points.iter().map(|pair| keypoint(pair[side])).collect(),
+                ..Features::default()
+            });
+            let photo = PhotoInfo {
+                name: String::new(),
+                width: 1000,
+                height: 1000,
+                group: 0,
+                focal_prior_px: None,
+                up: None,
+                camera: None,
+                mount: None,
+            };
+            let pair = PairMatches {
+                photos: [0, 1],
+                matches: (0..100).map(|i| [i, i]).collect(),
+            };
+            let pair = estimate_fundamental(0, &[photo.clone(), photo], &features, &pair, &MapOptions::default());
+            pair.is_some_and(|pair| pair.inliers[..35].iter().filter(|inlier| **inlier).count() > 30)
+        };
+        // 28 are found, and 10 with 600 samples; with noise, not every sample of inliers leads to the others.
+        let count = (0..32).filter(|seed| found(*seed)).count();
+        assert!(count >= 25, "{count} of 32");
+    }
 }

@@ -307,6 +307,8 @@ fn focal_lengths_that_differ_from_photograph_to_photograph_make_as_many_cameras(
     let longest = (0..24)
         .max_by(|a, b| zooms[*a].total_cmp(&zooms[*b]))
         .expect("photographs");
+    let contradictions = found.contradictions(&world.photos, &world.features);
+    assert_eq!(contradictions, 0, "each pair is compared through its own cameras");
     let mut photos = world.photos.clone();
     found.regroup(&mut photos);
     assert!(photos.iter().enumerate().all(|(i, photo)| photo.group == i));

@@ -232,13 +232,16 @@ impl Reconstruction {
     }
 
     /// Number of neighbours whose matches contradict the largest model; 0 for more than [`FEW_PHOTOS`] photographs, where some always do.
+    /// `photos` may have their groups from before mapping.
     pub fn contradictions(&self, photos: &[PhotoInfo], features: &[Features]) -> usize {
         let few = photos.len() <= FEW_PHOTOS;
         let Some(model) = self.models.first().filter(|_| few) else {
             return 0;
         };
-        let agreement = agreement(photos, features, &self.pairs, model);
-        contradictions(&self.pairs, &strengths(photos, features, &self.pairs), &agreement).len()
+        let mut photos = photos.to_vec();
+        self.regroup(&mut photos);
+        let agreement = agreement(&photos, features, &self.pairs, model);
+        contradictions(&self.pairs, &strengths(&photos, features, &self.pairs), &agreement).len()
     }
 
     /// Pairs of photographs that should share points and do not, without those in `matched`; empty if there are too few to rule out

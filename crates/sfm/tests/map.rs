@@ -116,9 +116,15 @@ fn a_model_is_completed_and_another_beside_it_stays() {
     assert!(seen.auc(&found, 1.0) > 90.0, "{}", seen.auc(&found, 1.0));
 }
 
+/// A wide lens whose photographs bend inwards.
+const DISTORTING: DCamera = DCamera {
+    parameters: [600.0, 600.0, 500.0, 375.0, -0.25, 0.06, 0.0, 0.0],
+    ..CAMERA
+};
+
 /// A wavy wall in front of `photos` cameras 9 degrees apart, on which each descriptor is shared by four points far from each other: its
 /// points, its photographs with their features, and the point of each keypoint.
-fn repetitive_wall(photos: usize) -> (Vec<DVec3>, Vec<PhotoInfo>, Vec<Features>, Vec<Vec<usize>>) {
+fn repetitive_wall(photos: usize, camera: DCamera) -> (Vec<DVec3>, Vec<PhotoInfo>, Vec<Features>, Vec<Vec<usize>>) {
     let mut rng = Rng::new(5, 0);
     let wall: Vec<DVec3> = (0..400)
         .map(|_| {
@@ -137,7 +143,7 @@ fn repetitive_wall(photos: usize) -> (Vec<DVec3>, Vec<PhotoInfo>, Vec<Features>,
     for pose in &around(40, 1.0)[..photos] {
         let here: Vec<usize> = (0..wall.len()).filter(|_| rng.uniform() < 0.8).collect();
         let place = |point: &usize| {
-            let at = CAMERA.pixel(pose.camera_from_world(wall[*point]));
+            let at = camera.pixel(pose.camera_from_world(wall[*point]));
             let mut noise = || 0.3 * rng.normal();
             Keypoint {
                 x: at.x as f32 + noise(),
@@ -172,38 +178,75 @@ fn photo() -> PhotoInfo {
 
 #[test]
 fn a_verified_pair_gains_the_look_alikes_along_its_lines() {
-    let (_, photos, features, shown) = repetitive_wall(2);
-    let right = |[i, j]: &[u32; 2]| shown[0][*i as usize] == shown[1][*j as usize];
-    let all: Vec<[u32; 2]> = (0..shown[0].len() as u32)
-        .flat_map(|i| (0..shown[1].len() as u32).map(move |j| [i, j]))
-        .filter(right)
-        .collect();
-    let pairs = [PairMatches {
-        photos: [0, 1],
-        matches: all.iter().step_by(8).copied().collect(),
-    }];
-    let matches = |guided: bool| {
-        let options = MapOptions {
-            guided,
-            ..MapOptions::default()
+    for camera in [CAMERA, DISTORTING] {
+        let (_, photos, features, shown) = repetitive_wall(2, camera);
+        let right = |[i, j]: &[u32; 2]| shown[0][*i as usize] == shown[1][*j as usize];
+        let all: Vec<[u32; 2]> = (0..shown[0].len() as u32)
+            .flat_map(|i| (0..shown[1].len() as u32).map(move |j| [i, j]))
+            .filter(right)
+            .collect();
+        let pairs = [PairMatches {
+            photos: [0, 1],
+            matches: all.iter().step_by(8).copied().collect(),
+        }];
+        // The weaker lens is not known.
+        let known = KnownGeometry {
+            poses: vec![None; 2],
+            cameras: vec![Some(camera)],
         };
-        let (_, mut verified) = verify(&photos, &features, &pairs, &options, &mut |_| ());
-        verified.remove(0).matches
+        let matches = |guided: bool| {
+            let options = MapOptions {
+                guided,
+                ..MapOptions::default()
+            };
+            let mut verified = if camera == CAMERA {
+                verify(&photos, &features, &pairs, &options, &mut |_| ()).1
+            } else {
+                extend(&photos, &features, &pairs, &known, &options, &mut |_| ()).pairs
+            };
+            verified.remove(0).matches
+        };
+        let (given, guided) = (matches(false), matches(true));
+        assert!(given.len() <= pairs[0].matches.len());
+        let right = guided.iter().filter(|pair| right(pair)).count();
+        assert!(
+            right > 5 * given.len() && 20 * right > 19 * guided.len(),
+            "{right} of {} are right, {} without lines",
+            guided.len(),
+            given.len()
+        );
+    }
+}
+
+#[test]
+fn matches_in_the_corners_of_a_known_distorting_lens_are_kept() {
+    let mut rng = Rng::new(6, 1);
+    let mut direction = move || DVec3::from_array([0; 3].map(|_| f64::from(rng.range(-1.0, 1.0))));
+    let points: Vec<(DVec3, DVec3)> = (0..1000)
+        .map(|_| (4.0 * direction(), direction().normalize()))
+        .collect();
+    let world = World::of_points(DISTORTING, around(6, 0.2), &points, 0, 0.3, 0.0, 6);
+    let known = KnownGeometry {
+        poses: vec![None; 6],
+        cameras: vec![Some(DISTORTING)],
     };
-    let (given, guided) = (matches(false), matches(true));
-    assert!(given.len() <= pairs[0].matches.len());
-    let right = guided.iter().filter(|pair| right(pair)).count();
-    assert!(
-        right > 5 * given.len() && 20 * right > 19 * guided.len(),
-        "{right} of {} are right, {} without lines",
-        guided.len(),
-        given.len()
+    let options = MapOptions::default();
+    let result = extend(
+        &world.photos,
+        &world.features,
+        &world.pairs,
+        &known,
+        &options,
+        &mut |_| (),
     );
+    let kept: usize = result.pairs.iter().map(|pair| pair.matches.len()).sum();
+    let all: usize = world.pairs.iter().map(|pair| pair.matches.len()).sum();
+    assert!(20 * kept > 19 * all, "{kept} of {all}");
 }
 
 #[test]
 fn look_alikes_match_along_the_lines_of_known_poses() {
-    let (wall, photos, features, shown) = repetitive_wall(6);
+    let (wall, photos, features, shown) = repetitive_wall(6, CAMERA);
     let known = ModelPoint {
         position: DVec3::new(9.0, 9.0, 9.0),
         error: 0.5,

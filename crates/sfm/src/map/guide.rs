@@ -89,25 +89,11 @@ struct PinholePhoto {
 
 impl PinholePhoto {
     fn new(photo: usize, features: &Features, camera: &DCamera, pose: DPose) -> Self {
-        let [fx, fy, cx, cy, ..] = camera.parameters;
-        let place = |keypoint: &Keypoint| {
-            // Keypoints that no pinhole camera shows are moved far away from all lines.
-            let at = camera.unproject(keypoint.at()).unwrap_or(DVec2::splat(1e6));
-            Keypoint {
-                x: (at.x * fx + cx) as f32,
-                y: (at.y * fy + cy) as f32,
-                ..*keypoint
-            }
-        };
         Self {
             photo: photo as u32,
             pose,
             inverse: inverse_calibration(camera),
-            features: Features {
-                keypoints: features.keypoints.iter().map(place).collect(),
-                descriptors: features.descriptors.clone(),
-                frontal: features.frontal.clone(),
-            },
+            features: pinhole_features(features, camera),
         }
     }
 
@@ -115,6 +101,25 @@ impl PinholePhoto {
     fn on_plane(&self, keypoint: u32) -> DVec2 {
         let at = self.features.keypoints[keypoint as usize].at();
         (self.inverse * at.extend(1.0)).truncate()
+    }
+}
+
+/// Features at the pixels at which a camera without distortion would show them.
+pub(super) fn pinhole_features(features: &Features, camera: &DCamera) -> Features {
+    let [fx, fy, cx, cy, ..] = camera.parameters;
+    let place = |keypoint: &Keypoint| {
+        // Keypoints that no pinhole camera shows are moved far away from all lines.
+        let at = camera.unproject(keypoint.at()).unwrap_or(DVec2::splat(1e6));
+        Keypoint {
+            x: (at.x * fx + cx) as f32,
+            y: (at.y * fy + cy) as f32,
+            ..*keypoint
+        }
+    };
+    Features {
+        keypoints: features.keypoints.iter().map(place).collect(),
+        descriptors: features.descriptors.clone(),
+        frontal: features.frontal.clone(),
     }
 }
 

@@ -2,6 +2,7 @@
 
 use super::Unverified;
 use super::focal::{self, FocalSource};
+use super::guide::pinhole_features;
 use super::types::{GroupCamera, MapOptions, PairKind, PhotoInfo, Progress, VerifiedPair};
 use crate::geometry::camera::DCamera;
 use crate::geometry::correspondences::{Correspondences, sampson_squared};
@@ -231,14 +232,8 @@ fn verify_calibrated(
 ) -> Option<VerifiedPair> {
     let group = pair.photos.map(|p| &cameras[photos[p as usize].group]);
     let [camera_a, camera_b]: [&DCamera; 2] = group.map(|g| &g.camera);
-    let plane = |camera: &DCamera, at: DVec2| {
-        if camera.fisheye {
-            // NaN is never an inlier.
-            return camera.unproject(at).unwrap_or(DVec2::NAN);
-        }
-        let [fx, fy, cx, cy, ..] = camera.parameters;
-        DVec2::new((at.x - cx) / fx, (at.y - cy) / fy)
-    };
+    // NaN is never an inlier.
+    let plane = |camera: &DCamera, at: DVec2| camera.unproject(at).unwrap_or(DVec2::NAN);
     let [features_a, features_b] = pair.photos.map(|p| &features[p as usize]);
     let normalized = |matches: &[[u32; 2]]| -> Vec<[DVec2; 2]> {
         matches
@@ -289,20 +284,22 @@ fn verify_calibrated(
     let mut motion = refined(motion_in_front(best.model, kept.iter()).0, &kept);
     let mut angle = median_angle(&motion, &kept);
     if options.guided && angle >= MIN_PARALLAX_RADIANS && !(camera_a.fisheye || camera_b.fisheye) {
-        let fundamental = match better {
+        let guided_by = |fundamental: DMat3, a: &Features, b: &Features| {
+            let lines = TwoViewGeometry::Fundamental(fundamental);
+            let distance = GUIDED_DISTANCE_RATIO * options.max_epipolar_error;
+            match_guided(a, b, &lines, distance, &MatchOptions::default())
+        };
+        let guided = match better {
             Some(uncalibrated) => {
                 let [a, b] = pair.photos.map(|p| to_centered(&photos[p as usize]));
-                b.transpose() * uncalibrated.matrix * a
+                guided_by(b.transpose() * uncalibrated.matrix * a, features_a, features_b)
             }
-            None => inverse_calibration(camera_b).transpose() * motion.essential() * inverse_calibration(camera_a),
+            None => guided_by(
+                inverse_calibration(camera_b).transpose() * motion.essential() * inverse_calibration(camera_a),
+                &pinhole_features(features_a, camera_a),
+                &pinhole_features(features_b, camera_b),
+            ),
         };
-        let guided = match_guided(
-            features_a,
-            features_b,
-            &TwoViewGeometry::Fundamental(fundamental),
-            GUIDED_DISTANCE_RATIO * options.max_epipolar_error,
-            &MatchOptions::default(),
-        );
         if guided.len() > matches.len() {
             kept = normalized(&guided);
             motion = refined(motion, &kept);

@@ -32,6 +32,12 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
     if !unposed.is_empty() {
         warnings.push(format!("{} photographs are not aligned and are skipped", unposed.len()));
     }
+    let skewed = posed.iter().filter(|camera| camera.is_skewed).count();
+    if skewed > 0 {
+        warnings.push(format!(
+            "the skew (b2) of {skewed} photographs is ignored; optimise the cameras without it, or undistort the photographs"
+        ));
+    }
     let view = |camera: MetashapeCamera| {
         let name = camera.label.replace('\\', "/");
         let image = locate_image(&root, &IMAGE_FOLDERS, &name);
@@ -54,6 +60,8 @@ pub(crate) struct MetashapeCamera {
     /// `None` if it is not aligned.
     pose: Option<DeclaredPose>,
     intrinsics: DeclaredCamera,
+    /// Whether its columns are not perpendicular to its rows, which `intrinsics` cannot say.
+    is_skewed: bool,
 }
 
 /// Rotation, translation and scale from a chunk to the world.
@@ -72,9 +80,10 @@ pub(crate) fn parse_metashape(bytes: &[u8]) -> Result<Vec<MetashapeCamera>, Malf
     for sensor in chunk.descendants("sensor") {
         // A panorama needs no calibration, and a sensor that took no aligned photograph has none.
         if let (Some(id), Some("spherical")) = (sensor.attribute("id"), sensor.attribute("type")) {
-            sensors.insert(id, DeclaredCamera::panorama());
+            sensors.insert(id, (DeclaredCamera::panorama(), false));
         } else if let (Some(id), Some(calibration)) = (sensor.attribute("id"), calibration(sensor)) {
-            sensors.insert(id, intrinsics(sensor, calibration)?);
+            let is_skewed = number(calibration, "b2").is_some_and(|b2| b2 != 0.0);
+            sensors.insert(id, (intrinsics(sensor, calibration)?, is_skewed));
         }
     }
     let world_from_chunk = chunk.child("transform").and_then(transform);
@@ -91,12 +100,13 @@ pub(crate) fn parse_metashape(bytes: &[u8]) -> Result<Vec<MetashapeCamera>, Malf
             .ok_or_else(|| Malformed("a <camera> has no label".into()))?;
         let matrix = camera.child("transform").map(Element::numbers);
         let sensor = camera.attribute("sensor_id").and_then(|id| sensors.get(id));
-        let (Some(matrix), Some(intrinsics)) = (matrix, sensor) else {
-            if let Some(intrinsics) = sensors.values().next() {
+        let (Some(matrix), Some((intrinsics, is_skewed))) = (matrix, sensor) else {
+            if let Some((intrinsics, is_skewed)) = sensors.values().next() {
                 found.push(MetashapeCamera {
                     label: label.to_owned(),
                     pose: None,
                     intrinsics: *intrinsics,
+                    is_skewed: *is_skewed,
                 });
             }
             continue;
@@ -112,6 +122,7 @@ pub(crate) fn parse_metashape(bytes: &[u8]) -> Result<Vec<MetashapeCamera>, Malf
             label: label.to_owned(),
             pose: pose(&matrix, component.or(world_from_chunk.as_ref())),
             intrinsics: *intrinsics,
+            is_skewed: *is_skewed,
         });
     }
     Ok(found)
@@ -147,6 +158,11 @@ fn transform(element: &Element) -> Option<Transform> {
     })
 }
 
+/// A parameter of a calibration.
+fn number(calibration: &Element, name: &str) -> Option<f64> {
+    calibration.child(name)?.numbers().first().copied()
+}
+
 fn intrinsics(sensor: &Element, calibration: &Element) -> Result<DeclaredCamera, Malformed> {
     let resolution = calibration.child("resolution").or_else(|| sensor.child("resolution"));
     let side = |name: &str| -> Option<f64> { resolution?.attribute(name)?.parse().ok() };
@@ -156,32 +172,28 @@ fn intrinsics(sensor: &Element, calibration: &Element) -> Result<DeclaredCamera,
     let Some((width, height)) = size else {
         return Err(Malformed("a sensor has no resolution".into()));
     };
-    let number = |name: &str| {
-        calibration
-            .child(name)
-            .and_then(|child| child.numbers().first().copied())
-    };
+    let number = |name: &str| number(calibration, name);
     let coefficient = |name: &str| number(name).unwrap_or(0.0);
     let kind = calibration
         .attribute("type")
         .or_else(|| sensor.attribute("type"))
         .unwrap_or("frame");
+    let p = [coefficient("p2"), coefficient("p1")];
     let lens = match kind {
         "frame" if coefficient("k4") == 0.0 => Lens::Opencv {
             k: [coefficient("k1"), coefficient("k2"), coefficient("k3"), 0.0, 0.0, 0.0],
-            p: [coefficient("p2"), coefficient("p1")],
+            p,
         },
         "frame" => {
             return Err(Malformed(
                 "a sensor has a k4, which is not supported; optimise the cameras without it, or undistort the photographs".into(),
             ));
         }
-        "fisheye" | "equidistant_fisheye" => Lens::fisheye([
-            coefficient("k1"),
-            coefficient("k2"),
-            coefficient("k3"),
-            coefficient("k4"),
-        ]),
+        "fisheye" | "equidistant_fisheye" => Lens::Fisheye {
+            k: ["k1", "k2", "k3", "k4"].map(coefficient),
+            p,
+            s: [0.0; 2],
+        },
         other => {
             return Err(Malformed(format!(
                 "the sensor type `{other}` is not supported; undistort the photographs as frame cameras"
@@ -209,4 +221,25 @@ fn intrinsics(sensor: &Element, calibration: &Element) -> Result<DeclaredCamera,
         center: Some(center),
         lens: lens_or_pinhole(lens),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_fisheye_has_tangential_distortion_and_skew_is_noticed() {
+        let text = br#"<document><chunk><sensors><sensor id="0" type="fisheye"><calibration type="fisheye">
+            <resolution width="64" height="48"/><f>20</f><k1>0.1</k1><k4>0.4</k4><p1>0.01</p1><p2>0.02</p2><b2>0.5</b2>
+            </calibration></sensor></sensors><cameras><camera id="0" sensor_id="0" label="a">
+            <transform>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform></camera></cameras></chunk></document>"#;
+        let cameras = parse_metashape(text).unwrap();
+        let lens = Lens::Fisheye {
+            k: [0.1, 0.0, 0.0, 0.4],
+            p: [0.02, 0.01],
+            s: [0.0; 2],
+        };
+        assert_eq!(cameras[0].intrinsics.lens, lens);
+        assert!(cameras[0].is_skewed);
+    }
 }

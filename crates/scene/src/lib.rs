@@ -26,7 +26,7 @@ mod shutter;
 mod similarity;
 mod srgb;
 
-pub use camera::{Camera, Intrinsics};
+pub use camera::{Camera, Intrinsics, PLAUSIBLE_FOCALS};
 pub use cloud::GaussianCloud;
 pub use dataset::{
     Dataset, DepthGrid, Grid, GridSource, Kept, LoadError, NormalGrid, Photo, PhotoSource, View, every_eighth,

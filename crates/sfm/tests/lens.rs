@@ -97,39 +97,49 @@ fn metadata_are_checked_against_the_photographs() {
     }
 }
 
+/// Ten photographs of a deep scene by a camera whose focal length is `by_side` long sides.
+fn before_a_deep_scene(by_side: f64) -> World {
+    let camera = DCamera::centered(CAMERA.width, CAMERA.height, by_side * f64::from(CAMERA.width));
+    let mut rng = Rng::new(4, 1);
+    let mut uniform = || f64::from(rng.range(-1.0, 1.0));
+    // The points are in sight at a distance of 5, in front of the cameras.
+    let reach = (2.5 / by_side).min(4.0);
+    let points: Vec<(DVec3, DVec3)> = (0..1500)
+        .map(|_| {
+            let place = DVec3::new(reach * uniform(), 2.0 * uniform(), reach * uniform());
+            (place, DVec3::NEG_Y)
+        })
+        .collect();
+    let poses = (0..10).map(|i| {
+        let aside = f64::from(i) / 4.5 - 1.0;
+        look(
+            DVec3::new(2.5 * aside, -5.0, aside * aside),
+            DVec3::new(0.3 * aside, 0.0, 0.0),
+        )
+    });
+    World::of_points(camera, poses.collect(), &points, 0, 0.5, 0.1, 4)
+}
+
 #[test]
 fn the_pairs_tell_the_focal_length_of_narrow_and_of_very_wide_views() {
     for by_side in [0.31, 0.45, 0.87, 3.0] {
-        let focal = by_side * f64::from(CAMERA.width);
-        let camera = DCamera::centered(CAMERA.width, CAMERA.height, focal);
-        let mut rng = Rng::new(4, 1);
-        let mut uniform = || f64::from(rng.range(-1.0, 1.0));
-        // The points are in sight at a distance of 5, in front of the cameras.
-        let reach = (2.5 / by_side).min(4.0);
-        let points: Vec<(DVec3, DVec3)> = (0..1500)
-            .map(|_| {
-                let place = DVec3::new(reach * uniform(), 2.0 * uniform(), reach * uniform());
-                (place, DVec3::NEG_Y)
-            })
-            .collect();
-        let poses = (0..10).map(|i| {
-            let aside = f64::from(i) / 4.5 - 1.0;
-            look(
-                DVec3::new(2.5 * aside, -5.0, aside * aside),
-                DVec3::new(0.3 * aside, 0.0, 0.0),
-            )
-        });
-        let world = World::of_points(camera, poses.collect(), &points, 0, 0.5, 0.1, 4);
+        let world = before_a_deep_scene(by_side);
         let options = MapOptions::default();
         let (cameras, _) = verify(&world.photos, &world.features, &world.pairs, &options, &mut |_| ());
         let GroupCamera { camera: found, source } = cameras[0];
         assert_eq!(source, FocalSource::Pairs, "{by_side}");
-        assert!(
-            (found.focal() / focal - 1.0).abs() < 0.1,
-            "{by_side}: {}",
-            found.focal()
-        );
+        let focal = found.focal() / found.long_side();
+        assert!((focal / by_side - 1.0).abs() < 0.1, "{by_side}: {focal}");
     }
+}
+
+#[test]
+fn a_telephoto_lens_is_calibrated() {
+    let mut world = before_a_deep_scene(14.0);
+    world.photos.iter_mut().for_each(|p| p.focal_prior_px = Some(13_000.0));
+    let result = world.map();
+    let camera = result.models[0].cameras[0].expect("registered");
+    assert!((camera.focal() / 14_000.0 - 1.0).abs() < 0.02, "{camera:?}");
 }
 
 #[test]

@@ -9,6 +9,7 @@ use crate::adjust::{
 use crate::geometry::camera::DCamera;
 use crate::geometry::pose::DPose;
 use glam::DVec2;
+use irradia_scene::PLAUSIBLE_FOCALS;
 
 /// The loss while the model grows and poses may be far off, and the final one, which gives wrong matches less weight.
 const GROWING_LOSS: Loss = Loss::SoftL1(1.0);
@@ -67,13 +68,11 @@ impl GrowingModel<'_> {
             iterations,
             tolerance,
         };
-        let report = problem.solve(&options);
+        let report = self.solve(&mut problem, &options);
         for (reference, pose) in reference_photos.into_iter().zip(&problem.poses) {
             self.set_rig_pose(reference, *pose);
         }
-        for group in 0..self.cameras.len() {
-            self.adopt_camera(group, problem.cameras[group].camera);
-        }
+        self.cameras = problem.cameras.iter().map(|adjusted| adjusted.camera).collect();
         for (track, point) in chosen.iter().zip(&problem.points) {
             self.points[*track] = Some(*point);
         }
@@ -133,11 +132,12 @@ impl GrowingModel<'_> {
             };
         }
         self.add_points(&mut problem, &tracks, |track| !variable[track], &view_of);
-        problem.solve(&AdjustOptions {
+        let options = AdjustOptions {
             loss: GROWING_LOSS,
             iterations: 6,
             tolerance: 1e-3,
-        });
+        };
+        self.solve(&mut problem, &options);
         for (reference, pose) in local.into_iter().zip(&problem.poses) {
             self.set_rig_pose(reference, *pose);
         }
@@ -145,7 +145,7 @@ impl GrowingModel<'_> {
             self.points[*track] = Some(*point);
         }
         if freedom != Freedom::HELD {
-            self.adopt_camera(group, problem.cameras[group].camera);
+            self.cameras[group] = problem.cameras[group].camera;
             self.undistort();
         }
         self.filter(&tracks);
@@ -303,16 +303,32 @@ impl GrowingModel<'_> {
         camera_prior(&self.cameras[group], self.initial_focals[group], focal)
     }
 
-    /// Adopts an adjusted camera if its values are plausible; otherwise its focal length is held fixed from now on.
-    fn adopt_camera(&mut self, group: usize, camera: DCamera) {
-        let focal = camera.focal() / camera.long_side();
-        let lens = camera.parameters[4..].iter().all(|k| k.abs() < 1.0);
-        if (0.2..10.0).contains(&focal) && lens {
-            self.cameras[group] = camera;
-        } else {
-            self.focal_held[group] = true;
+    /// Solves `problem`, whose cameras are those of the groups. If the adjusted values of a camera are not plausible, its poses and points
+    /// are not either: the problem is solved again with this camera held, and its focal length is held from now on.
+    fn solve(&mut self, problem: &mut Problem, options: &AdjustOptions) -> AdjustReport {
+        loop {
+            let mut solved = problem.clone();
+            let report = solved.solve(options);
+            let mut is_plausible = true;
+            for (group, solved) in solved.cameras.iter().enumerate() {
+                if solved.freedom != Freedom::HELD && !has_plausible_values(&solved.camera) {
+                    problem.cameras[group].freedom = Freedom::HELD;
+                    self.focal_held[group] = true;
+                    is_plausible = false;
+                }
+            }
+            if is_plausible {
+                *problem = solved;
+                return report;
+            }
         }
     }
+}
+
+/// Whether the focal length is one that cameras have, and the lens distorts like those of cameras.
+fn has_plausible_values(camera: &DCamera) -> bool {
+    PLAUSIBLE_FOCALS.contains(&(camera.focal() / camera.long_side()))
+        && camera.parameters[4..].iter().all(|k| k.abs() < 1.0)
 }
 
 /// Which intrinsics of a finished model's camera are adjusted, depending on the number of its photographs: all but the principal point.

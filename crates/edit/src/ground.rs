@@ -1,8 +1,8 @@
 //! The ground: the densest plane below the cameras.
 
 use crate::Draft;
-use glam::{DMat3, DVec3};
-use irradia_scene::Rng;
+use glam::{DMat3, DQuat, DVec3, Vec3};
+use irradia_scene::{Camera, Rng, survey};
 use irradia_splat::sigmoid;
 use rayon::prelude::*;
 
@@ -31,18 +31,22 @@ pub struct Ground {
 }
 
 /// Finds the up direction and the ground in the coordinates of the dataset: up is near the cameras' mean up, and the ground is the plane
-/// that contains the most opacity and has the cameras above it. Without such a plane, up is the cameras' mean up. `None` without cameras.
+/// that contains the most opacity and has the cameras above it. Without such a plane, up is the cameras' mean up. Cameras that look straight
+/// down, as in a survey, have up behind them instead. `None` without cameras.
 pub fn ground(draft: &Draft) -> Option<Ground> {
     if draft.cameras.is_empty() {
         return None;
     }
-    let cameras = draft.cameras.iter().map(|c| c.pose);
-    let up = cameras
-        .clone()
-        .map(|pose| (pose.rotation * glam::Vec3::NEG_Y).as_dvec3());
-    let up = up.sum::<DVec3>().normalize_or(DVec3::NEG_Y);
-    let eyes: Vec<DVec3> = cameras.map(|pose| pose.position.as_dvec3()).collect();
+    let of = |camera: &Camera| (camera.pose.rotation.as_dquat(), camera.pose.position.as_dvec3());
+    let cameras: Vec<(DQuat, DVec3)> = draft.cameras.iter().map(of).collect();
     let points = sample_points(draft);
+    let mean_up = || {
+        let ups = draft.cameras.iter().map(|camera| camera.pose.rotation * Vec3::NEG_Y);
+        ups.map(|up| up.as_dvec3()).sum::<DVec3>()
+    };
+    let up = survey(&cameras, points.iter().copied()).map_or_else(mean_up, |survey| survey.up);
+    let up = up.normalize_or(DVec3::NEG_Y);
+    let eyes: Vec<DVec3> = cameras.iter().map(|(_, position)| *position).collect();
     let plane = densest_plane(&points, &eyes, up);
     let world = draft.cloud.world_from_dataset;
     Some(Ground {

@@ -25,6 +25,7 @@ pub mod sh;
 mod shutter;
 mod similarity;
 mod srgb;
+mod survey;
 
 pub use camera::{Camera, Intrinsics, PLAUSIBLE_FOCALS};
 pub use cloud::GaussianCloud;
@@ -41,3 +42,4 @@ pub use rng::Rng;
 pub use shutter::{FirstSide, RollingShutter};
 pub use similarity::Similarity;
 pub use srgb::{srgb_from_linear, srgb_slope};
+pub use survey::{Survey, survey};

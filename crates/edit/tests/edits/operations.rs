@@ -1,7 +1,7 @@
 use crate::{apply_line, cloud, difference, draft, edited};
-use glam::{DQuat, DVec3};
+use glam::{DQuat, DVec3, Vec3};
 use irradia_edit::{Draft, Edit, History, Operation, apply, open_nothing};
-use irradia_scene::{ExtraColumn, Scalar, Similarity};
+use irradia_scene::{Camera, ExtraColumn, Intrinsics, Pose, Scalar, Similarity};
 
 /// Edits that do not change a single bit.
 #[test]
@@ -294,6 +294,23 @@ fn the_ground_is_the_densest_plane_below_the_cameras() {
     assert!(DVec3::from(found.up).dot(normal) > 0.9999, "{found:?}");
     let height = DVec3::from(found.point.expect("a plane")).dot(normal);
     assert!((height + 2.0).abs() < 0.01, "{height}");
+}
+
+#[test]
+fn a_survey_from_above_stays_level() {
+    let cameras = (0..20).map(|i| {
+        let eye = Vec3::new((i % 5) as f32 - 2.0, (i / 5) as f32 - 1.5, 3.0);
+        // +Y is at the top of each photograph.
+        Camera::new(
+            Pose::look_at(eye, eye + Vec3::NEG_Z, Vec3::Y),
+            Intrinsics::from_fov_x(96, 72, 0.9),
+        )
+    });
+    let mut floor = cloud(600, 0, 7);
+    floor.means.iter_mut().for_each(|mean| mean[2] *= 0.01);
+    let found = irradia_edit::ground(&Draft::new(floor, cameras.collect())).expect("there are cameras");
+    assert!(DVec3::from(found.up).dot(DVec3::Z) > 0.999, "{found:?}");
+    assert!(found.point.expect("a plane")[2].abs() < 0.02, "{found:?}");
 }
 
 #[test]

@@ -1,14 +1,12 @@
 //! HEIC, the format of phones' photographs: images coded as HEVC in a HEIF container (ISO/IEC 23008-12), as an [`ImageDecoder`].
 
+use crate::image_file::MAX_PIXELS;
 use heifer::heifer_isobmff::boxes::Property;
 use heifer::heifer_isobmff::{HeifFile, ItemId};
 use heifer::{Options, decode_rgba8};
 use image::error::{DecodingError, ImageFormatHint};
 use image::metadata::Orientation;
 use image::{ColorType, ImageDecoder, ImageError, ImageResult};
-
-/// Maximum number of pixels, above the largest sensors of phones (200 megapixels); a damaged file may declare any size.
-const MAX_PIXELS: u64 = 1 << 28;
 
 /// Many photographs are decoded at a time; more threads per photograph would only contend with each other.
 const DECODE_OPTIONS: Options = Options {

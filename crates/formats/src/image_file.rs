@@ -12,6 +12,9 @@ use std::fs::File;
 use std::io::{self, BufRead, BufReader, Cursor, Read, Seek};
 use std::path::Path;
 
+/// Maximum number of pixels, above the largest renders and the sensors of phones (200 megapixels); a damaged file may declare any size.
+pub(crate) const MAX_PIXELS: u64 = 1 << 28;
+
 /// An image with 8 bits per channel.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Pixels {
@@ -181,6 +184,9 @@ fn read_jpeg_header(path: &Path) -> Result<Option<Header>, FormatError> {
     let mut decoder = jpeg_decoder::Decoder::new(reader);
     let size = decoder.read_info().ok().and_then(|()| decoder.info());
     let exif = decoder.exif_data().and_then(Orientation::from_exif_chunk);
+    if let Some(info) = size {
+        check_size(path, info.width.into(), info.height.into())?;
+    }
     Ok(size
         .filter(|info| info.width > 0 && info.height > 0)
         .map(|info| Header {
@@ -351,6 +357,7 @@ pub(crate) fn decode_jpeg_scaled(path: &Path, divisor: u32, orientation: Orienta
     let mut decoder = jpeg_decoder::Decoder::new(&bytes[..]);
     decoder.read_info().map_err(jpeg_error)?;
     let [full_width, full_height] = decoder.info().map_or([0; 2], |info| [info.width, info.height]);
+    check_size(path, full_width.into(), full_height.into())?;
     let size = [full_width, full_height].map(|side| u32::from(side).div_ceil(divisor).max(1));
     decoder.scale(size[0] as u16, size[1] as u16).map_err(jpeg_error)?;
     let data = decoder.decode().map_err(jpeg_error)?;
@@ -426,7 +433,19 @@ fn open(path: &Path) -> Result<(Box<dyn ImageDecoder>, bool), FormatError> {
     }
     let reader = ImageReader::new(source).with_guessed_format().map_err(read_error)?;
     let decoder = reader.into_decoder().map_err(|error| undecodable(path, &error))?;
+    let (width, height) = decoder.dimensions();
+    check_size(path, width, height)?;
     Ok((Box::new(decoder), jpeg))
+}
+
+/// Refuses an image of more than [`MAX_PIXELS`] pixels before they are decoded.
+fn check_size(path: &Path, width: u32, height: u32) -> Result<(), FormatError> {
+    if u64::from(width) * u64::from(height) <= MAX_PIXELS {
+        return Ok(());
+    }
+    let message =
+        format!("an image of {width}x{height} pixels, more than 268 megapixels; make it smaller or remove it");
+    Err(FormatError::malformed(path, message))
 }
 
 /// The file, whether it is complete, and whether it is a JPEG.
@@ -530,6 +549,30 @@ mod tests {
                 .to_string()
                 .contains("truncated")
         );
+    }
+
+    #[test]
+    fn a_small_file_that_declares_a_huge_image_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.jpg");
+        image::RgbImage::new(16, 16).save(&path).unwrap();
+        let mut bytes = std::fs::read(&path).unwrap();
+        // The frame's header: marker, length, precision, height and width.
+        let frame = bytes.windows(2).position(|marker| marker == [0xFF, 0xC0]).unwrap();
+        bytes[frame + 5..frame + 9].copy_from_slice(&[0xFF, 0xDC, 0xFF, 0xDC]);
+        std::fs::write(&path, bytes).unwrap();
+        let upright = Orientation::NoTransforms;
+        for result in [
+            read_header(&path).map(|_| ()),
+            decode(&path, upright, Colour::Keep).map(|_| ()),
+            decode_jpeg_scaled(&path, 8, upright).map(|_| ()),
+        ] {
+            let error = result.unwrap_err().to_string();
+            assert!(
+                error.contains("65500x65500 pixels, more than 268 megapixels"),
+                "{error}"
+            );
+        }
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! `OpenEXR`: linear colours from renderers, as an [`ImageDecoder`], and depths and normals from renderers and phones, as stored.
 
+use crate::image_file::MAX_PIXELS;
 use exr::error::Error;
 use exr::image::{AnyChannel, FlatSamples};
 use exr::meta::MetaData;
@@ -10,8 +11,6 @@ use image::{ColorType, ImageDecoder, ImageError, ImageResult};
 use irradia_scene::srgb_from_linear;
 use std::io::{BufRead, Read, Seek, SeekFrom};
 
-/// Maximum number of pixels, above the largest renders and sensors; a damaged file may declare any size.
-const MAX_PIXELS: usize = 1 << 28;
 /// Maximum number of decoded bytes per byte of a file, more than the best compression achieves (of a single colour, about 1,000 to one).
 const MAX_DECODED_PER_BYTE: u64 = 4096;
 /// Last parts of the names of channels that hold depths, in order of preference.
@@ -128,8 +127,8 @@ fn read_header(source: &mut (impl BufRead + Seek)) -> Result<([usize; 2], bool),
         .ok_or(Error::NotSupported("deep data".into()))?;
     let Vec2(width, height) = header.shared_attributes.display_window.size;
     let area = |size: Vec2<usize>| size.0.saturating_mul(size.1);
-    let pixels = area(header.layer_size).max(width.saturating_mul(height));
-    let decoded = (pixels as u64).saturating_mul(header.channels.bytes_per_pixel as u64);
+    let pixels = area(header.layer_size).max(width.saturating_mul(height)) as u64;
+    let decoded = pixels.saturating_mul(header.channels.bytes_per_pixel as u64);
     if pixels > MAX_PIXELS || width.min(height) == 0 || decoded / MAX_DECODED_PER_BYTE > end {
         return Err(Error::NotSupported(
             format!("{width}x{height} pixels in {end} bytes").into(),

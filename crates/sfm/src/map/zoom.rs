@@ -144,7 +144,12 @@ fn focal_distribution(photos: &[PhotoInfo], features: &[Features], model: &Model
     let groups = model.cameras.len();
     let of_group =
         |group: usize| (0..photos.len()).filter(move |p| photos[*p].group == group && model.poses[*p].is_some());
-    if (0..groups).all(|group| of_group(group).count() < 2 * MIN_CLUSTER_PHOTOS) {
+    // A camera that is known exactly has one focal length, such as that of the faces of panoramas.
+    let is_known = |group: usize| of_group(group).any(|p| photos[p].camera.is_some());
+    let examined: Vec<usize> = (0..groups)
+        .filter(|group| of_group(*group).count() >= 2 * MIN_CLUSTER_PHOTOS && !is_known(*group))
+        .collect();
+    if examined.is_empty() {
         return FocalDistribution::Shared;
     }
     let (focals, cost_reduction) = own_focals(photos, features, model, MAX_OWN_CAMERAS);
@@ -156,7 +161,7 @@ fn focal_distribution(photos: &[PhotoInfo], features: &[Features], model: &Model
         logs.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         logs
     };
-    let clustered = (0..groups).find_map(|group| {
+    let clustered = examined.iter().copied().find_map(|group| {
         let sorted = sorted(group);
         let (split, medians) = clusters(&sorted)?;
         let (short, long) = sorted.split_at(split);
@@ -171,11 +176,10 @@ fn focal_distribution(photos: &[PhotoInfo], features: &[Features], model: &Model
             focals: [medians[1 - smaller].exp(), medians[smaller].exp()],
         })
     });
-    let varies = |group: usize| {
-        let logs = sorted(group);
-        let middle = logs.get(logs.len() / 2).map_or(0.0, |v| v.0);
-        logs.len() >= 2 * MIN_CLUSTER_PHOTOS
-            && median(logs.iter().map(|v| (v.0 - middle).abs()).collect()).is_some_and(|m| m > MIN_OWN_FOCAL_DEVIATION)
+    let varies = |group: &usize| {
+        let logs = sorted(*group);
+        let middle = logs[logs.len() / 2].0;
+        median(logs.iter().map(|v| (v.0 - middle).abs()).collect()).is_some_and(|m| m > MIN_OWN_FOCAL_DEVIATION)
     };
     // A lens that is known from metadata or from a rig is not given up.
     let has_no_metadata =
@@ -184,7 +188,7 @@ fn focal_distribution(photos: &[PhotoInfo], features: &[Features], model: &Model
         Some(zoom) => FocalDistribution::Clustered(zoom),
         None if cost_reduction > MIN_OWN_COST_REDUCTION
             && photos.iter().all(has_no_metadata)
-            && (0..groups).any(varies) =>
+            && examined.iter().any(varies) =>
         {
             FocalDistribution::Own
         }
@@ -340,12 +344,16 @@ mod tests {
     use glam::{DQuat, DVec3};
     use irradia_scene::Rng;
 
-    #[test]
-    fn focal_lengths_are_found_in_parts_as_in_one_adjustment() {
+    /// The focal length of each of twelve photographs around an object.
+    fn zoomed(photo: usize) -> f64 {
+        [800.0, 1200.0][photo / 2 % 2]
+    }
+
+    /// Those photographs with the features of 80 points, and a model in which they share a focal length of 1,000 px.
+    fn two_settings() -> (Vec<PhotoInfo>, Vec<Features>, Model) {
         let mut rng = Rng::new(5, 0);
         let mut uniform = || f64::from(rng.range(-1.5, 1.5));
         let points: Vec<DVec3> = (0..80).map(|_| DVec3::new(uniform(), uniform(), uniform())).collect();
-        let truth = |photo: usize| [800.0, 1200.0][photo / 2 % 2];
         let poses: Vec<DPose> = (0..12)
             .map(|photo| {
                 let rotation = DQuat::from_rotation_y(f64::from(photo) * std::f64::consts::TAU / 12.0);
@@ -354,11 +362,11 @@ mod tests {
             })
             .collect();
         let keypoint = |photo: usize, point: &DVec3| {
-            let at = DCamera::centered(1000, 1000, truth(photo)).pixel(poses[photo].camera_from_world(*point));
-            let (x, y) = (at.x as f32, at.y as f32);
+            let camera = DCamera::centered(1000, 1000, zoomed(photo));
+            let at = camera.pixel(poses[photo].camera_from_world(*point));
             Keypoint {
-                x,
-                y,
+                x: at.x as f32,
+                y: at.y as f32,
                 scale: 2.0,
                 angle: 0.0,
             }
@@ -367,7 +375,7 @@ mod tests {
             keypoints: points.iter().map(|point| keypoint(photo, point)).collect(),
             ..Features::default()
         };
-        let features: Vec<Features> = (0..12).map(of_photo).collect();
+        let features = (0..12).map(of_photo).collect();
         let photo = PhotoInfo {
             name: String::new(),
             width: 1000,
@@ -389,14 +397,30 @@ mod tests {
             poses: poses.iter().copied().map(Some).collect(),
             focal_held: vec![false],
         };
+        (vec![photo; 12], features, model)
+    }
+
+    #[test]
+    fn focal_lengths_are_found_in_parts_as_in_one_adjustment() {
+        let (photos, features, model) = two_settings();
         for max_cameras in [12, 6] {
-            let (focals, cost_reduction) = own_focals(&vec![photo.clone(); 12], &features, &model, max_cameras);
+            let (focals, cost_reduction) = own_focals(&photos, &features, &model, max_cameras);
             assert!(cost_reduction > 0.9, "{max_cameras}: {cost_reduction}");
             for (i, focal) in focals.into_iter().enumerate() {
                 // The prior of the shared focal length is weak: 5 % tells the two settings apart.
-                assert!((focal / truth(i) - 1.0).abs() < 0.05, "{max_cameras}: {i} {focal}");
+                assert!((focal / zoomed(i) - 1.0).abs() < 0.05, "{max_cameras}: {i} {focal}");
             }
         }
+    }
+
+    #[test]
+    fn a_camera_that_is_known_is_not_divided() {
+        let (mut photos, features, model) = two_settings();
+        let found = focal_distribution(&photos, &features, &model);
+        assert!(matches!(found, FocalDistribution::Clustered(_)));
+        photos.iter_mut().for_each(|photo| photo.camera = model.cameras[0]);
+        let found = focal_distribution(&photos, &features, &model);
+        assert!(matches!(found, FocalDistribution::Shared));
     }
 
     #[test]

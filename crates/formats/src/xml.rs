@@ -77,12 +77,12 @@ pub fn parse_xml(bytes: &[u8]) -> Result<Element, Malformed> {
         let last = open.len() - 1;
         open[last].text.push_str(&unescaped(&rest[..at]));
         rest = &rest[at..];
-        if let Some((end, after)) = [("<!--", "-->"), ("<?", "?>"), ("<![CDATA[", "]]>"), ("<!", ">")]
-            .into_iter()
-            .find(|(start, _)| rest.starts_with(start))
-            .and_then(|(_, end)| rest.split_once(end))
-        {
-            if let Some(data) = end.strip_prefix("<![CDATA[") {
+        let special = [("<!--", "-->"), ("<?", "?>"), ("<![CDATA[", "]]>"), ("<!", ">")];
+        if let Some((start, end)) = special.into_iter().find(|(start, _)| rest.starts_with(start)) {
+            // Were it skipped as a tag, each of many would be searched to the end of the file.
+            let unclosed = || malformed(&format!("a {start} has no {end}"));
+            let (content, after) = rest.split_once(end).ok_or_else(unclosed)?;
+            if let Some(data) = content.strip_prefix("<![CDATA[") {
                 open[last].text.push_str(data);
             }
             rest = after;
@@ -219,6 +219,9 @@ mod tests {
             "<a",
             "<a b=\"x/>",
             "<!-- a",
+            "<a><?b/></a>",
+            "<a><!--/></a>",
+            "<a><![CDATA[/></a>",
         ] {
             assert!(parse_xml(text.as_bytes()).is_err(), "{text}");
         }

@@ -30,8 +30,10 @@ pub struct NvmModel {
 pub struct NvmImage {
     /// File, relative to the model's.
     pub name: String,
-    /// Pixels.
-    pub focal: f64,
+    /// fx and fy, pixels.
+    pub focal: [f64; 2],
+    /// The principal point, pixels; the photograph's centre if `None`.
+    pub principal: Option<[f64; 2]>,
     /// Camera-from-world, `w, x, y, z`.
     pub rotation: [f64; 4],
     /// The camera's centre.
@@ -89,9 +91,10 @@ pub fn parse_nvm(bytes: &[u8]) -> Result<Vec<NvmModel>, Malformed> {
     let mut lines = text
         .lines()
         .filter(|line| !line.trim().is_empty() && !line.starts_with('#'));
-    if !lines.next().is_some_and(|line| line.starts_with("NVM_V3")) {
+    let Some(header) = lines.next().filter(|line| line.starts_with("NVM_V3")) else {
         return Err(Malformed("not an NVM file of version 3".into()));
-    }
+    };
+    let calibration = fixed_calibration(header)?;
     let count = |line: Option<&str>| -> Result<usize, Malformed> { Tokens::new(line.unwrap_or("0")).next("a count") };
     let mut models = Vec::new();
     loop {
@@ -101,7 +104,11 @@ pub fn parse_nvm(bytes: &[u8]) -> Result<Vec<NvmModel>, Malformed> {
         }
         let mut model = NvmModel::default();
         for _ in 0..images {
-            model.images.push(parse_image(lines.next().unwrap_or_default())?);
+            let mut image = parse_image(lines.next().unwrap_or_default())?;
+            if let Some([fx, cx, fy, cy]) = calibration {
+                (image.focal, image.principal) = ([fx, fy], Some([cx, cy]));
+            }
+            model.images.push(image);
         }
         for _ in 0..count(lines.next())? {
             model
@@ -111,6 +118,14 @@ pub fn parse_nvm(bytes: &[u8]) -> Result<Vec<NvmModel>, Malformed> {
         models.push(model);
     }
     Ok(models)
+}
+
+/// fx, cx, fy and cy of all photographs, if the first line has them: `NVM_V3 FixedK fx cx fy cy r`. Each photograph has its own r.
+fn fixed_calibration(header: &str) -> Result<Option<[f64; 4]>, Malformed> {
+    let numbers = header.split_once("FixedK").map(|(_, numbers)| numbers);
+    numbers
+        .map(|numbers| Tokens::new(numbers).numbers("a number of the fixed calibration"))
+        .transpose()
 }
 
 fn parse_image(line: &str) -> Result<NvmImage, Malformed> {
@@ -125,7 +140,8 @@ fn parse_image(line: &str) -> Result<NvmImage, Malformed> {
     let [focal, w, x, y, z, cx, cy, cz, radial, _] = Tokens::new(&numbers).numbers("a number of a photograph")?;
     Ok(NvmImage {
         name: words[..length].join(" "),
-        focal,
+        focal: [focal; 2],
+        principal: None,
         rotation: [w, x, y, z],
         center: [cx, cy, cz],
         radial,
@@ -151,11 +167,30 @@ fn declared_camera(image: &NvmImage) -> DeclaredCamera {
     let r = image.radial;
     DeclaredCamera {
         size: None,
-        focal: Focal::Pixels([image.focal; 2]),
-        center: None,
+        focal: Focal::Pixels(image.focal),
+        center: image.principal,
         lens: lens_or_pinhole(Lens::Opencv {
             k: [-r, 3.0 * r * r, -12.0 * r * r * r, 0.0, 0.0, 0.0],
             p: [0.0; 2],
         }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_fixed_calibration_is_that_of_all_photographs() {
+        let model = |header: &str| format!("{header}\n\n1\na.png 400 1 0 0 0 1 2 3 0.1 0\n\n0\n0\n");
+        let camera = |header: &str| {
+            let models = parse_nvm(model(header).as_bytes()).unwrap();
+            let image = &models[0].images[0];
+            (image.focal, image.principal, image.radial)
+        };
+        assert_eq!(camera("NVM_V3 "), ([400.0; 2], None, 0.1));
+        let fixed = camera("NVM_V3 FixedK 500 33 510 24 0.1");
+        assert_eq!(fixed, ([500.0, 510.0], Some([33.0, 24.0]), 0.1));
+        assert!(parse_nvm(model("NVM_V3 FixedK 500 33").as_bytes()).is_err());
     }
 }

@@ -4,9 +4,6 @@ use glam::{DVec2, DVec3, Vec2, Vec3};
 /// Maximum angle between a direction and that of its pixel, radians; it is larger only where a lens folds.
 const SAME_DIRECTION: f64 = 1e-3;
 
-/// Focal lengths that cameras have, relative to the longer side of their photographs: 3.6 mm to 1.8 m for a frame of 35 mm film.
-pub const PLAUSIBLE_FOCALS: std::ops::Range<f64> = 0.1..50.0;
-
 /// Intrinsic parameters of a camera, in pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Intrinsics {

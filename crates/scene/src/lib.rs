@@ -27,7 +27,7 @@ mod similarity;
 mod srgb;
 mod survey;
 
-pub use camera::{Camera, Intrinsics, PLAUSIBLE_FOCALS};
+pub use camera::{Camera, Intrinsics};
 pub use cloud::GaussianCloud;
 pub use dataset::{
     Dataset, DepthGrid, Grid, GridSource, Kept, LoadError, NormalGrid, Photo, PhotoSource, View, every_eighth,

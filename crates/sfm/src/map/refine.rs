@@ -9,8 +9,12 @@ use crate::adjust::{
 use crate::geometry::camera::DCamera;
 use crate::geometry::pose::DPose;
 use glam::DVec2;
-use irradia_scene::PLAUSIBLE_FOCALS;
+use std::ops::Range;
 
+/// Focal lengths, in long sides, that an adjustment may find whatever it began with: of 7 to 360 mm for a frame of 35 mm film.
+const USUAL_FOCALS: Range<f64> = 0.2..10.0;
+/// Ratios to the initial focal length that it may always find.
+const NEAR_INITIAL: Range<f64> = 0.5..2.0;
 /// The loss while the model grows and poses may be far off, and the final one, which gives wrong matches less weight.
 const GROWING_LOSS: Loss = Loss::SoftL1(1.0);
 const FINAL_LOSS: Loss = Loss::Cauchy(1.0);
@@ -311,7 +315,8 @@ impl GrowingModel<'_> {
             let report = solved.solve(options);
             let mut is_plausible = true;
             for (group, solved) in solved.cameras.iter().enumerate() {
-                if solved.freedom != Freedom::HELD && !has_plausible_values(&solved.camera) {
+                let is_free = solved.freedom != Freedom::HELD;
+                if is_free && !has_plausible_values(&solved.camera, self.initial_focals[group]) {
                     problem.cameras[group].freedom = Freedom::HELD;
                     self.focal_held[group] = true;
                     is_plausible = false;
@@ -325,10 +330,12 @@ impl GrowingModel<'_> {
     }
 }
 
-/// Whether the focal length is one that cameras have, and the lens distorts like those of cameras.
-fn has_plausible_values(camera: &DCamera) -> bool {
-    PLAUSIBLE_FOCALS.contains(&(camera.focal() / camera.long_side()))
-        && camera.parameters[4..].iter().all(|k| k.abs() < 1.0)
+/// Whether the focal length is usual or near the `initial` one, such as a telephoto lens's in metadata, and the lens distorts like those of
+/// cameras.
+fn has_plausible_values(camera: &DCamera, initial: f64) -> bool {
+    let is_usual = USUAL_FOCALS.contains(&(camera.focal() / camera.long_side()));
+    let is_near = NEAR_INITIAL.contains(&(camera.focal() / initial));
+    (is_usual || is_near) && camera.parameters[4..].iter().all(|k| k.abs() < 1.0)
 }
 
 /// Which intrinsics of a finished model's camera are adjusted, depending on the number of its photographs: all but the principal point.

@@ -15,12 +15,9 @@ use crate::trainer::{TrainError, Trainer};
 use irradia_scene::Camera;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Fraction of a run after which the decision is made.
+/// Fraction of a run after which the decision is made. Later ones cost more than they gain, since splats have to unlearn the exposures:
+/// a courthouse, 249 photographs, 1,500 steps, decided after 150 and 498, 20.35 and 19.74 dB after colour correction.
 const PROBE_AT: f64 = 0.1;
-/// Minimum number of steps per training view before the decision: splats that have seen a photograph once do not show its colours yet.
-const MIN_VISITS: usize = 2;
-/// Fraction of a run after which it is too late for the decision.
-const PROBE_UNTIL: f64 = 0.5;
 /// Number of training views to measure in a run too short to measure all: enough for a standard deviation accurate to a tenth.
 const SAMPLED_VIEWS: usize = 64;
 /// Minimum number of views for a decision.
@@ -90,11 +87,8 @@ impl Trainer {
         if self.recipe.exposure != Choice::Auto || self.sockets.bilateral.is_some() || self.field.is_some() {
             return false;
         }
-        let total = self.recipe.total_steps() as f64;
-        let visits = (MIN_VISITS * self.trained.len()) as u64;
-        let is_ready = |time: f64, step: u64| time >= PROBE_AT * total && step >= visits;
-        let (now, step) = (self.clock.time, self.clock.step);
-        is_ready(now, step) && !is_ready(before, step - 1) && now <= PROBE_UNTIL * total
+        let at = PROBE_AT * self.recipe.total_steps() as f64;
+        before < at && self.clock.time >= at
     }
 
     /// The training views to measure: all, or in a short run some with the nearest to each.

@@ -16,6 +16,7 @@ use crate::matching::{MatchOptions, TwoViewGeometry, match_guided};
 use crate::{Features, Keypoint};
 use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
+use std::borrow::Cow;
 use std::collections::HashSet;
 
 /// Maximum distance of a match from its epipolar line, px: small, because the poses are known.
@@ -93,7 +94,7 @@ impl PinholePhoto {
             photo: photo as u32,
             pose,
             inverse: inverse_calibration(camera),
-            features: pinhole_features(features, camera),
+            features: pinhole_features(features, camera).into_owned(),
         }
     }
 
@@ -105,8 +106,11 @@ impl PinholePhoto {
 }
 
 /// Features at the pixels at which a camera without distortion would show them.
-pub(super) fn pinhole_features(features: &Features, camera: &DCamera) -> Features {
-    let [fx, fy, cx, cy, ..] = camera.parameters;
+pub(super) fn pinhole_features<'a>(features: &'a Features, camera: &DCamera) -> Cow<'a, Features> {
+    let [fx, fy, cx, cy, distortion @ ..] = camera.parameters;
+    if !camera.fisheye && distortion.iter().all(|k| *k == 0.0) {
+        return Cow::Borrowed(features);
+    }
     let place = |keypoint: &Keypoint| {
         // Keypoints that no pinhole camera shows are moved far away from all lines.
         let at = camera.unproject(keypoint.at()).unwrap_or(DVec2::splat(1e6));
@@ -116,11 +120,11 @@ pub(super) fn pinhole_features(features: &Features, camera: &DCamera) -> Feature
             ..*keypoint
         }
     };
-    Features {
+    Cow::Owned(Features {
         keypoints: features.keypoints.iter().map(place).collect(),
         descriptors: features.descriptors.clone(),
         frontal: features.frontal.clone(),
-    }
+    })
 }
 
 /// The matches along epipolar lines, in front of both cameras, of all pairs of the model's photographs that look in similar directions.

@@ -220,7 +220,7 @@ documented! {
         /// Opacity below which a splat is removed.
         pub min_opacity: f32,
         /// Mean weight per frame, in pixels, below which a splat is removed. It must have been in view of at least two frames and as many as
-        /// a tenth of the training views: in a house, splats are in most views behind walls, and shown by few.
+        /// a fifth of the training views: in a house, splats are in most views behind walls, and shown by few.
         pub min_weight: f32,
         /// Mean error per frame, mean absolute colour difference times pixels, from which a splat is split.
         pub error_threshold: f32,
@@ -241,7 +241,7 @@ impl FastSettings {
             floor,
             min_opacity: self.min_opacity,
             min_weight: self.min_weight,
-            min_frames: (views as f32 / 10.0).max(2.0),
+            min_frames: (views as f32 / 5.0).max(2.0),
             error_threshold: self.error_threshold * pace as f32,
             min_extent: self.min_extent,
         }

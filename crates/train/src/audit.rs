@@ -13,7 +13,7 @@ const MISFITS_AT: f64 = 0.2;
 const TRANSIENTS_AT: [f64; 3] = [0.3, 0.45, 0.6];
 /// Minimum number of a run's steps per training view for a decision on every view: with fewer, the renders would cost more than a twentieth
 /// of the run.
-const MIN_STEPS_PER_VIEW: usize = 8;
+const MIN_STEPS_PER_VIEW: f64 = 8.0;
 
 impl Trainer {
     /// Does what is due after a step that began at `before`, in steps of the recipe: leaves out misfits, hides transients.
@@ -21,7 +21,7 @@ impl Trainer {
         let (total, now) = (self.recipe.total_steps() as f64, self.clock.time);
         let passes = |at: f64| before < at * total && now >= at * total;
         let mut events = Vec::new();
-        if !self.can_render_all_views() {
+        if !self.can_render_all_views(1.0) {
             return Ok(events);
         }
         if self.recipe.drop_misfits && passes(MISFITS_AT) {
@@ -39,9 +39,10 @@ impl Trainer {
         Ok(events)
     }
 
-    /// Whether the run is long enough to render every training view once more.
-    pub(crate) fn can_render_all_views(&self) -> bool {
-        self.total_steps() >= (MIN_STEPS_PER_VIEW * self.trained.len()) as u64
+    /// Whether the run is long enough to render every training view once more, at `image_scale`.
+    pub(crate) fn can_render_all_views(&self, image_scale: f32) -> bool {
+        let cost = f64::from(image_scale * image_scale) * self.trained.len() as f64;
+        self.total_steps() as f64 >= MIN_STEPS_PER_VIEW * cost
     }
 
     /// The error of each training view over all pixels, and over the pixels that fit best.

@@ -11,5 +11,5 @@ pub mod pose;
 pub mod ransac;
 pub mod resection;
 #[cfg(test)]
-pub(crate) mod testing;
+mod testing;
 pub mod triangulate;

@@ -76,24 +76,16 @@ pub fn estimate<E: Estimator>(problem: &E, first: Vec<E::Model>, limits: Limits)
 /// Number of samples needed for the confidence, given the inliers of the best model so far.
 fn needed_samples<M>(best: &Option<Estimate<M>>, n: usize, sample: usize, limits: Limits) -> usize {
     let Some(best) = best else { return limits.samples };
-    let inlier_fraction = best.inliers as f64 / n as f64;
-    limits
-        .samples
-        .min(samples_for(limits.confidence, inlier_fraction, sample))
-}
-
-/// Number of samples of size `sample` of which one has inliers only with the probability `confidence`.
-pub fn samples_for(confidence: f64, inlier_fraction: f64, sample: usize) -> usize {
-    let clean_fraction = inlier_fraction.powi(sample as i32);
+    let clean_fraction = (best.inliers as f64 / n as f64).powi(sample as i32);
     if clean_fraction >= 1.0 {
-        return 1;
+        return limits.samples.min(1);
     }
-    let samples = (1.0 - confidence).ln() / (1.0 - clean_fraction).ln();
-    if samples.is_finite() {
+    let samples = (1.0 - limits.confidence).ln() / (1.0 - clean_fraction).ln();
+    limits.samples.min(if samples.is_finite() {
         samples.ceil() as usize
     } else {
         usize::MAX
-    }
+    })
 }
 
 /// Replaces `best` by `model` if that is better, refined as long as that improves it.

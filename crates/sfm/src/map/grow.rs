@@ -21,6 +21,9 @@ const MAX_SEED_CANDIDATES: usize = 20 * MAX_SEEDS;
 const MIN_EXPLAINED_FRACTION: f64 = 0.8;
 /// Number of times a photograph is tried before it is given up.
 const MAX_REGISTRATION_ATTEMPTS: usize = 3;
+/// Number of times a photograph is removed before it is given up: many, since photographs of narrow views are removed until the focal length
+/// is found.
+const MAX_REMOVALS: usize = 10;
 /// Minimum number of points of a pair of photographs for a seed.
 const MIN_SEED_POINTS: usize = 12;
 /// Minimum fraction of inliers among the points that a photograph shows. Photographs with less than the first wait until the others are
@@ -278,7 +281,8 @@ impl GrowingModel<'_> {
     /// Photographs to register, best first: those that show many points of the model, spread over the photograph.
     fn registration_candidates(&self, assigned: &[bool]) -> Vec<usize> {
         let mut scored: Vec<(usize, usize)> = (0..self.poses.len())
-            .filter(|p| self.poses[*p].is_none() && !assigned[*p] && self.failures[*p] < MAX_REGISTRATION_ATTEMPTS)
+            .filter(|p| self.poses[*p].is_none() && !assigned[*p])
+            .filter(|p| self.failures[*p] < MAX_REGISTRATION_ATTEMPTS && self.removals[*p] < MAX_REMOVALS)
             .filter_map(|photo| {
                 let (count, score) = self.visibility(photo);
                 (count >= self.options.min_registration_inliers).then_some((score, photo))

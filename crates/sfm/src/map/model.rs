@@ -38,8 +38,9 @@ pub(super) struct GrowingModel<'a> {
     pub points: Vec<Option<DVec3>>,
     /// `[observations]` whether an observation belongs to its track's point.
     pub used: Vec<bool>,
-    /// `[photos]` how often a photograph could not be registered, or was registered and removed.
+    /// `[photos]` how often a photograph could not be registered, and how often it was registered and removed.
     pub failures: Vec<usize>,
+    pub removals: Vec<usize>,
 }
 
 impl<'a> GrowingModel<'a> {
@@ -62,6 +63,7 @@ impl<'a> GrowingModel<'a> {
             points: vec![None; tracks.len()],
             used: vec![false; tracks.observations.len()],
             failures: vec![0; photos.len()],
+            removals: vec![0; photos.len()],
         };
         for photo in photos.iter().filter(|photo| photo.camera.is_some()) {
             model.held_cameras[photo.group] = true;
@@ -210,13 +212,13 @@ impl<'a> GrowingModel<'a> {
         self.used[self.tracks.range(track)].fill(false);
     }
 
-    /// Removes the poses of a photograph and of those on its rig, and the points that are then seen less than twice. This counts as a
-    /// failure: the photograph would be registered with the same pose and removed for ever.
+    /// Removes the poses of a photograph and of those on its rig, and the points that are then seen less than twice. Removals are
+    /// counted: the photograph might be registered with the same pose and removed for ever.
     pub fn deregister(&mut self, photo: usize) {
         for i in 0..self.rigs[photo].len() {
             let removed = self.rigs[photo][i];
             self.remove_pose(removed);
-            self.failures[removed] += 1;
+            self.removals[removed] += 1;
         }
     }
 

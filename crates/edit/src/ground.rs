@@ -14,7 +14,7 @@ const MAX_DRAWS: usize = 200_000;
 const SAMPLED_SPLATS: usize = 20_000;
 /// Half the thickness of the plane, as a fraction of the median distance of splats from their centre.
 const HALF_THICKNESS: f64 = 0.02;
-/// Cosine of the largest angle between the ground's normal and the cameras' mean up: people tilt their cameras.
+/// Cosine of the largest angle between the ground's normal and the cameras' up: people tilt their cameras.
 const MIN_UP_COSINE: f64 = 0.7;
 /// Sizes are clamped to this fraction of the scene's: the background's splats are huge.
 const MAX_SPLAT_SIZE: f64 = 0.05;

@@ -25,6 +25,15 @@ impl Transform {
         translation: DVec3::ZERO,
     };
 
+    /// The world of a scene in `world` after the whole scene was moved: only rotations then change coordinates of the world.
+    pub fn moved_world(&self, world: &Similarity) -> Similarity {
+        // world = s (d - c) and d' = k R d + t: with s' = s / k and c' = k R c + t, world' = s' (d' - c') = R world.
+        Similarity {
+            scale: world.scale / self.scale,
+            center: self.apply(world.center),
+        }
+    }
+
     /// From the dataset's coordinates to `world`.
     pub fn to_world(world: &Similarity) -> Self {
         Self {
@@ -128,11 +137,7 @@ fn rotate_and_scale(cloud: &mut GaussianCloud, selected: Option<&[bool]>, transf
 /// unless the world's coordinates were those of the dataset and can stay so.
 pub(crate) fn transform_scene(draft: &mut Draft, transform: &Transform) {
     let old = draft.cloud.world_from_dataset;
-    // world = s (d - c) and d' = k R d + t: with s' = s / k and c' = k R c + t, world' = s' (d' - c') = R world.
-    let world = Similarity {
-        scale: old.scale / transform.scale,
-        center: transform.apply(old.center),
-    };
+    let world = transform.moved_world(&old);
     let turn = transform.rotation;
     if turn != DQuat::IDENTITY {
         draft.cloud.means.par_iter_mut().for_each(|mean| {

@@ -184,17 +184,17 @@ fn read_jpeg_header(path: &Path) -> Result<Option<Header>, FormatError> {
     let mut decoder = jpeg_decoder::Decoder::new(reader);
     let size = decoder.read_info().ok().and_then(|()| decoder.info());
     let exif = decoder.exif_data().and_then(Orientation::from_exif_chunk);
-    if let Some(info) = size {
-        check_size(path, info.width.into(), info.height.into())?;
-    }
-    Ok(size
-        .filter(|info| info.width > 0 && info.height > 0)
-        .map(|info| Header {
-            width: info.width.into(),
-            height: info.height.into(),
-            orientation: exif.unwrap_or(Orientation::NoTransforms),
-            jpeg: true,
-        }))
+    let Some(info) = size.filter(|info| info.width > 0 && info.height > 0) else {
+        return Ok(None);
+    };
+    let (width, height) = (info.width.into(), info.height.into());
+    check_size(path, width, height)?;
+    Ok(Some(Header {
+        width,
+        height,
+        orientation: exif.unwrap_or(Orientation::NoTransforms),
+        jpeg: true,
+    }))
 }
 
 /// What cameras write beside the pixels; empty if nothing can be read.
@@ -443,8 +443,9 @@ fn check_size(path: &Path, width: u32, height: u32) -> Result<(), FormatError> {
     if u64::from(width) * u64::from(height) <= MAX_PIXELS {
         return Ok(());
     }
+    let limit = MAX_PIXELS / 1_000_000;
     let message =
-        format!("an image of {width}x{height} pixels, more than 268 megapixels; make it smaller or remove it");
+        format!("an image of {width}x{height} pixels, more than {limit} megapixels; make it smaller or remove it");
     Err(FormatError::malformed(path, message))
 }
 

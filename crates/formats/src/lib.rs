@@ -36,7 +36,7 @@ pub use dataset::colmap::{
 };
 pub use dataset::{
     DEFAULT_MAX_SIDE, DatasetFormat, DatasetOptions, Holdout, Lenses, PANORAMA_MASKS, PANORAMAS, Readout,
-    SiblingFolder, read_dataset,
+    SiblingFolder, is_image_name, read_dataset,
 };
 pub use describe::{Description, Kind, describe, detect};
 pub use error::{FormatError, Malformed};

@@ -6,6 +6,7 @@ use glam::{DQuat, DVec3, Quat};
 use irradia_edit::Transform;
 use irradia_formats::write_atomic;
 use irradia_scene::{Camera, Dataset, Intrinsics, Pose, Similarity, View};
+use irradia_sfm::geometry::pose::DPose;
 use irradia_train::Trainer;
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
@@ -37,20 +38,13 @@ struct CameraRecord {
 }
 
 impl CameraRecord {
-    fn placed(&self) -> Placed {
+    fn pose(&self) -> DPose {
         let [w, x, y, z] = self.rotation.map(f64::from);
-        Placed {
+        DPose {
             position: self.position.into(),
             rotation: DQuat::from_xyzw(x, y, z, w).normalize(),
         }
     }
-}
-
-/// Where a camera is, in the dataset's coordinates.
-#[derive(Clone, Copy, Debug)]
-struct Placed {
-    position: DVec3,
-    rotation: DQuat,
 }
 
 /// An `f64` with the digits of an `f32`, so that files do not show digits beyond its precision.
@@ -120,7 +114,7 @@ pub fn moved_from_run(scene: &Path) -> Transform {
         .iter()
         .zip(own.iter().flatten())
         .filter(|(a, b)| a.name == b.name);
-    moved_between(&same.map(|(a, b)| [a.placed(), b.placed()]).collect::<Vec<_>>())
+    moved_between(&same.map(|(a, b)| [a.pose(), b.pose()]).collect::<Vec<_>>())
 }
 
 /// How the whole scene in the file `scene` was moved away from the photographs of `dataset`, in the dataset's coordinates: by the poses of
@@ -131,13 +125,13 @@ pub fn moved_from_dataset(scene: &Path, dataset: &Dataset) -> Option<Transform> 
     let records = camera_records(&cameras_file(scene)).unwrap_or_default();
     let pair = |record: &CameraRecord| {
         let pose = views.get(record.name.as_str())?.camera.pose;
-        let given = Placed {
+        let given = DPose {
             position: dataset.world_from_dataset.invert(pose.position.as_dvec3()),
             rotation: pose.rotation.as_dquat().normalize(),
         };
-        Some([given, record.placed()])
+        Some([given, record.pose()])
     };
-    let pairs: Vec<[Placed; 2]> = records.iter().filter_map(pair).collect();
+    let pairs: Vec<[DPose; 2]> = records.iter().filter_map(pair).collect();
     let unmoved = difference(&pairs, &Transform::IDENTITY);
     // The refined poses of a run may have drifted together, but its own scene is where its photographs are.
     if unmoved > SAME_POSES && (is_moved(scene) || RunFolder::containing(scene).is_none()) {
@@ -153,7 +147,7 @@ pub fn moved_from_dataset(scene: &Path, dataset: &Dataset) -> Option<Transform> 
 
 /// The median difference between the second pose of each pair and the first one moved by `by`: the distance in units of the cameras' mean
 /// distance from their centre, plus the angle in radians. 0 without pairs.
-fn difference(pairs: &[[Placed; 2]], by: &Transform) -> f64 {
+fn difference(pairs: &[[DPose; 2]], by: &Transform) -> f64 {
     let (_, spread) = center_and_spread(pairs, 1);
     let unit = if spread > 0.0 { spread } else { 1.0 };
     let each = pairs.iter().map(|[from, to]| {
@@ -166,7 +160,7 @@ fn difference(pairs: &[[Placed; 2]], by: &Transform) -> f64 {
 }
 
 /// The transform that moves the first poses of `pairs` to the second ones. Cameras that are all in one place do not determine a scale.
-fn moved_between(pairs: &[[Placed; 2]]) -> Transform {
+fn moved_between(pairs: &[[DPose; 2]]) -> Transform {
     let Some([first, moved_first]) = pairs.first() else {
         return Transform::IDENTITY;
     };
@@ -195,7 +189,7 @@ fn moved_between(pairs: &[[Placed; 2]]) -> Transform {
 }
 
 /// The mean of the positions at place `at` of each pair, and their mean distance from it.
-fn center_and_spread(pairs: &[[Placed; 2]], at: usize) -> (DVec3, f64) {
+fn center_and_spread(pairs: &[[DPose; 2]], at: usize) -> (DVec3, f64) {
     let (count, positions) = (pairs.len() as f64, pairs.iter().map(|pair| pair[at].position));
     let center = positions.clone().sum::<DVec3>() / count;
     (
@@ -214,8 +208,7 @@ pub(crate) fn moved(mut dataset: Dataset, by: &Transform) -> Dataset {
     }
     let points = dataset.points.iter_mut().flat_map(|points| &mut points.positions);
     points.for_each(|point| *point = turn * *point);
-    let world = &mut dataset.world_from_dataset;
-    (world.scale, world.center) = (world.scale / by.scale, by.apply(world.center));
+    dataset.world_from_dataset = by.moved_world(&dataset.world_from_dataset);
     dataset
 }
 
@@ -235,14 +228,15 @@ fn cameras_file(scene: &Path) -> PathBuf {
 /// # Errors
 /// When the file cannot be written or removed.
 pub fn write_own_cameras(from: &Path, to: &Path, moved: &Transform) -> Result<(), RunError> {
-    let is_in_run = to.with_file_name(CAMERAS).is_file();
-    let has_own = is_in_run && (is_moved(from) || !moved.is_identity());
-    match has_own.then(|| moved_cameras_json(from, moved)).flatten() {
-        Some(text) => Ok(write_atomic(&own_cameras_file(to), |out| out.write_all(&text))?),
-        None => match existing_own_cameras_file(to).filter(|_| is_in_run) {
-            Some(file) => fs::remove_file(&file).map_err(RunError::io("remove", &file)),
-            None => Ok(()),
-        },
+    if !to.with_file_name(CAMERAS).is_file() {
+        return Ok(());
+    }
+    let has_own = is_moved(from) || !moved.is_identity();
+    let own = has_own.then(|| moved_cameras_json(from, moved)).flatten();
+    match (own, existing_own_cameras_file(to)) {
+        (Some(text), _) => Ok(write_atomic(&own_cameras_file(to), |out| out.write_all(&text))?),
+        (None, Some(file)) => fs::remove_file(&file).map_err(RunError::io("remove", &file)),
+        (None, None) => Ok(()),
     }
 }
 

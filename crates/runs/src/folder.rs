@@ -104,11 +104,10 @@ impl RunRecord {
     fn parse(text: &[u8], folder: &Path) -> Result<Self, serde_json::Error> {
         let mut record: Self = serde_json::from_slice(text)?;
         let (input, posed) = (&mut record.input, folder.join(POSED_FOLDER));
+        input.data = folder.join(&input.data);
         // In earlier records, the path to a dataset in the run's own folder is absolute.
         if input.data.ends_with(POSED_FOLDER) && !input.data.exists() && posed.is_dir() {
             input.data = posed;
-        } else {
-            input.data = folder.join(&input.data);
         }
         if input.reading.is_holdout_list_missing() && folder.join(VIEWS).is_file() {
             // The run knows its held-out views by name: [`RunFolder::restore_holdout`].
@@ -259,9 +258,8 @@ impl RunFolder {
 
     /// The dataset of the run that contains the scene `path`, if its photographs were posed for it.
     pub fn posed_dataset(path: &Path) -> Option<PathBuf> {
-        let folder = Self::containing(path)?;
-        let data = Self::open(folder.path()).ok()?.1.input.data;
-        same_file(&data, &folder.file(POSED_FOLDER)).then_some(data)
+        let data = Self::record_containing(path)?.input.data;
+        same_file(&data, &Self::containing(path)?.file(POSED_FOLDER)).then_some(data)
     }
 
     /// Writes the list of training and held-out views.
@@ -354,8 +352,7 @@ impl RunFolder {
     }
 
     /// Writes `run.json`. A dataset in the folder itself is recorded relative to it, since the run may be moved.
-    pub(crate) fn write_record(&self, record: &RunRecord) -> Result<(), RunError> {
-        let mut record = record.clone();
+    pub(crate) fn write_record(&self, mut record: RunRecord) -> Result<(), RunError> {
         if let Ok(inside) = record.input.data.strip_prefix(absolute(self.0.clone()))
             && inside != Path::new("")
         {

@@ -53,14 +53,16 @@ pub fn level_file(path: &Path, level: u32) -> Result<PathBuf, RunError> {
     }
 }
 
+/// The files of the levels of the scene in the file `path`, whether they exist or not; none if its format has no levels.
+pub(crate) fn level_files(path: &Path) -> impl Iterator<Item = PathBuf> {
+    (1..=LEVELS).map_while(move |level| level_file(path, level).ok())
+}
+
 /// Writes a scene like [`write_splats_with`], and removes the levels beside it, which belong to the scene that it replaces.
 pub(crate) fn write_scene(path: &Path, cloud: &GaussianCloud, options: &WriteOptions) -> Result<Vec<String>, RunError> {
     let notes = write_splats_with(path, cloud, options)?;
-    for level in 1..=LEVELS {
-        let Ok(file) = level_file(path, level) else { break };
-        if file.is_file() {
-            fs::remove_file(&file).map_err(RunError::io("remove", &file))?;
-        }
+    for file in level_files(path).filter(|file| file.is_file()) {
+        fs::remove_file(&file).map_err(RunError::io("remove", &file))?;
     }
     Ok(notes)
 }
@@ -130,8 +132,7 @@ pub fn write_levels(input: &Path, output: &Path, options: &WriteOptions) -> Resu
 /// When a level exists and cannot be read.
 pub fn read_levels(path: &Path, count: usize) -> Result<Vec<Splats>, RunError> {
     let mut levels = Vec::new();
-    for level in 1..=LEVELS {
-        let Ok(file) = level_file(path, level) else { break };
+    for (level, file) in (1..).zip(level_files(path)) {
         if !file.is_file() {
             break;
         }

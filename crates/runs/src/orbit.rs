@@ -2,9 +2,8 @@
 
 use std::f32::consts::{FRAC_PI_2, PI, TAU};
 
-use glam::Vec3;
-use irradia_scene::{Camera, Intrinsics, Pose};
-use irradia_sfm::geometry::pose::DPose;
+use glam::{DQuat, DVec3, Vec3};
+use irradia_scene::{Camera, Intrinsics, Pose, survey};
 use irradia_sfm::upright;
 use irradia_splat::{Splats, init::focus_point};
 
@@ -82,21 +81,18 @@ pub(crate) fn orbit_geometry(splats: Option<&Splats>, cameras: Option<&[Camera]>
 }
 
 fn center_and_up(splats: Option<&Splats>, cameras: &[Camera]) -> (Vec3, Vec3) {
-    let pose = |camera: &Camera| DPose {
-        rotation: camera.pose.rotation.as_dquat(),
-        position: camera.pose.position.as_dvec3(),
-    };
-    let poses: Vec<DPose> = cameras.iter().map(pose).collect();
+    let pose = |camera: &Camera| (camera.pose.rotation.as_dquat(), camera.pose.position.as_dvec3());
+    let poses: Vec<(DQuat, DVec3)> = cameras.iter().map(pose).collect();
     let points = splats.into_iter().flat_map(|splats| {
         let every = splats.len().div_ceil(MAX_GROUND_SAMPLES).max(1);
         (0..splats.len())
             .step_by(every)
             .map(|i| Vec3::from(splats.mean(i)).as_dvec3())
     });
-    match upright::survey(&poses, points.filter(|point| point.is_finite())) {
+    match survey(&poses, points.filter(|point| point.is_finite())) {
         Some(survey) => (survey.center.as_vec3(), survey.up.as_vec3()),
         None => {
-            let up = upright::up(poses.iter().map(|pose| (pose.rotation, None)));
+            let up = upright::up(poses.iter().map(|(rotation, _)| (*rotation, None)));
             (focus_point(cameras), up.as_vec3())
         }
     }

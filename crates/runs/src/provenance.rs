@@ -1,6 +1,7 @@
 //! Fingerprints of a run's data and of the program, to detect changes.
 
 use crate::is_film_name;
+use irradia_formats::is_image_name;
 use irradia_scene::{Dataset, Lens};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -109,10 +110,6 @@ impl Hash {
     }
 }
 
-/// Extensions of photographs, masks, and maps of depth and normals.
-const IMAGE_EXTENSIONS: [&str; 11] = [
-    "png", "jpg", "jpeg", "webp", "tif", "tiff", "heic", "heif", "hif", "exr", "npy",
-];
 /// Maximum depth of the search for files, which a link back to a parent would otherwise make endless.
 const MAX_DEPTH: u32 = 6;
 
@@ -148,14 +145,15 @@ fn add_files(path: &Path, depth: u32, files: &mut Vec<(PathBuf, u64)>) {
             !name.starts_with('.') && !path.join("run.json").is_file()
         };
         let below = entries.flatten().map(|entry| entry.path()).filter(is_shown);
-        below
-            .filter(|_| depth > 0)
-            .for_each(|path| add_files(&path, depth - 1, files));
+        if depth > 0 {
+            below.for_each(|path| add_files(&path, depth - 1, files));
+        }
         return;
     }
-    let extension = path.extension().unwrap_or_default().to_ascii_lowercase();
-    let is_image = IMAGE_EXTENSIONS.iter().any(|image| extension == *image);
-    if (is_image || is_film_name(path))
+    let is_map = path
+        .extension()
+        .is_some_and(|extension| extension.eq_ignore_ascii_case("npy"));
+    if (is_image_name(path) || is_map || is_film_name(path))
         && let Ok(file) = fs::metadata(path)
     {
         files.push((path.to_owned(), file.len()));

@@ -116,7 +116,7 @@ impl Run {
             folder.write(REPEATED_PACES, paces.to_text().as_bytes())?;
         }
         // Last: a folder with this file has everything needed to resume.
-        folder.write_record(&RunRecord {
+        folder.write_record(RunRecord {
             input: request.input.clone(),
             complete: false,
         })?;
@@ -198,7 +198,7 @@ impl Run {
         }
         folder.write_views(&views)?;
         // With what was changed to resume, should this process die.
-        folder.write_record(&RunRecord {
+        folder.write_record(RunRecord {
             input: request.input.clone(),
             complete: record.complete,
         })?;
@@ -313,7 +313,7 @@ impl Run {
         let report = report?;
         self.write_report(&report)?;
         let complete = self.trainer.finished();
-        self.folder.write_record(&RunRecord {
+        self.folder.write_record(RunRecord {
             input: self.request.input,
             complete,
         })?;

@@ -2,7 +2,7 @@
 
 use crate::cameras::cameras_beside;
 use crate::folder::{APPEARANCE, EXPOSURES, FIELD, RESIDUAL, SCENE, SKY, VIGNETTE, world_beside};
-use crate::levels::{LEVELS, level_file};
+use crate::levels::level_files;
 use crate::orbit::{OrbitGeometry, orbit, orbit_geometry};
 use crate::{RunError, RunFolder};
 use irradia_edit::Draft;
@@ -127,10 +127,9 @@ pub fn check_not_overwritten(scene: &Path, output: &Path) -> Result<(), RunError
     let scene = scene_path(scene);
     // A folder of SOG images is written as its list.
     let list = output.join(SplatFormat::SogFolder.suffix());
-    let levels = (1..=LEVELS).map_while(|level| level_file(output, level).ok());
     if [output.to_owned(), list]
         .into_iter()
-        .chain(levels)
+        .chain(level_files(output))
         .any(|file| same_file(&file, &scene))
     {
         Err(RunError::Refused(format!(

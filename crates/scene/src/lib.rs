@@ -17,6 +17,7 @@ mod extra;
 pub mod half;
 mod image;
 mod lens;
+mod median;
 mod points;
 mod pose;
 mod resize;
@@ -35,6 +36,7 @@ pub use dataset::{
 pub use extra::{ExtraColumn, Scalar};
 pub use image::Image;
 pub use lens::Lens;
+pub use median::median;
 pub use points::PointCloud;
 pub use pose::Pose;
 pub use resize::{Part, resize_area, resize_part};

@@ -1,3 +1,4 @@
+use crate::median;
 use glam::{DQuat, DVec2, DVec3};
 
 /// Maximum standard deviation of the viewing directions of a survey about their mean, degrees.
@@ -29,12 +30,7 @@ pub fn survey(cameras: &[(DQuat, DVec3)], points: impl Iterator<Item = DVec3>) -
         return None;
     }
     let mean = cameras.iter().map(|(_, position)| *position).sum::<DVec3>() / n;
-    let mut depths: Vec<f64> = points.map(|point| (point - mean).dot(forward)).collect();
-    let middle = depths.len() / 2;
-    if depths.is_empty() {
-        return None;
-    }
-    let depth = *depths.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let depth = median(points.map(|point| (point - mean).dot(forward)).collect())?;
     // The smaller eigenvalue of the covariance of the positions, perpendicular to the views.
     let (x, y) = forward.any_orthonormal_pair();
     let [mut xx, mut xy, mut yy] = [0.0; 3];

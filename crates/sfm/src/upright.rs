@@ -1,9 +1,7 @@
 //! The up direction of a scene, from the orientation of its photographs.
 
 use crate::geometry::linear::{scatter, symmetric_eigen};
-use crate::geometry::pose::DPose;
 use glam::{DQuat, DVec3};
-use irradia_scene::Survey;
 
 /// The up direction, from the rotation of each camera to the world and the up direction in its own axes, if known: most photographs are
 /// level, so all their x axes are in one horizontal plane.
@@ -27,10 +25,4 @@ pub fn up(cameras: impl Iterator<Item = (DQuat, Option<DVec3>)>) -> DVec3 {
     } else {
         mean
     }
-}
-
-/// The survey of `points` by `cameras`, if they look straight down: see [`irradia_scene::survey`].
-pub fn survey(cameras: &[DPose], points: impl Iterator<Item = DVec3>) -> Option<Survey> {
-    let cameras: Vec<(DQuat, DVec3)> = cameras.iter().map(|pose| (pose.rotation, pose.position)).collect();
-    irradia_scene::survey(&cameras, points)
 }

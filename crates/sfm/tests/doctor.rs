@@ -309,8 +309,7 @@ fn focal_lengths_that_differ_from_photograph_to_photograph_make_as_many_cameras(
         .expect("photographs");
     let contradictions = found.contradictions(&world.photos, &world.features);
     assert_eq!(contradictions, 0, "each pair is compared through its own cameras");
-    let mut photos = world.photos.clone();
-    found.regroup(&mut photos);
+    let photos = found.regrouped(&world.photos);
     assert!(photos.iter().enumerate().all(|(i, photo)| photo.group == i));
     let [mapped, _] = examine_plain(&world);
     assert!(

@@ -65,15 +65,7 @@ fn photographs_are_registered_into_a_known_model_that_stays_as_it_is() {
         poses: (0..24).map(|i| (i < 16).then_some(world.poses[i])).collect(),
         cameras: vec![Some(world::CAMERA), None],
     };
-    let options = MapOptions::default();
-    let result = extend(
-        &world.photos,
-        &world.features,
-        &world.pairs,
-        &known,
-        &options,
-        &mut |_| (),
-    );
+    let result = world.extend(&known);
     let model = &result.models[0];
     assert_eq!(model.registered(), 24);
     assert!(model.poses[..16] == known.poses[..16] && model.cameras[0] == known.cameras[0]);
@@ -230,15 +222,7 @@ fn matches_in_the_corners_of_a_known_distorting_lens_are_kept() {
         poses: vec![None; 6],
         cameras: vec![Some(DISTORTING)],
     };
-    let options = MapOptions::default();
-    let result = extend(
-        &world.photos,
-        &world.features,
-        &world.pairs,
-        &known,
-        &options,
-        &mut |_| (),
-    );
+    let result = world.extend(&known);
     let kept: usize = result.pairs.iter().map(|pair| pair.matches.len()).sum();
     let all: usize = world.pairs.iter().map(|pair| pair.matches.len()).sum();
     assert!(20 * kept > 19 * all, "{kept} of {all}");

@@ -14,7 +14,8 @@ pub struct SplatState {
     pub splats: Splats,
     /// Adam's first and second moments.
     pub moments: [Splats; 2],
-    /// Statistics accumulated since the last round of density control: planes [`SplatState::GRADIENT`], [`SplatState::SEEN`],
+    /// Statistics accumulated since the last round of density control, or several rounds for splats rarely in view of
+    /// [`crate::densify::fast`]: planes [`SplatState::GRADIENT`], [`SplatState::SEEN`],
     /// [`SplatState::EXTENT`], [`SplatState::ERROR`], [`SplatState::WEIGHT`].
     pub statistics: Planes,
     /// Variance of each splat's 3D smoothing filter, world units squared, 1 plane; zeros where the recipe has no filter.
@@ -142,7 +143,7 @@ impl SplatState {
         kept: Vec<u32>,
         added: &[&Splats],
         reset: &[u32],
-        keeps_statistics: impl Fn(u32) -> bool + Sync,
+        keeps_statistics: impl Fn(&Planes, u32) -> bool + Sync,
     ) {
         let n = self.len() as u32;
         let new = added.iter().map(|splats| splats.len() as u32).sum::<u32>();
@@ -160,7 +161,13 @@ impl SplatState {
             column.rearrange(&order, &added, &mut scratch);
         }
         self.filter.rearrange(&order, &[], &mut scratch);
-        let kept_statistics = |i: &u32| if *i < n && keeps_statistics(*i) { *i } else { u32::MAX };
+        let kept_statistics = |i: &u32| {
+            if *i < n && keeps_statistics(&self.statistics, *i) {
+                *i
+            } else {
+                u32::MAX
+            }
+        };
         let statistics: Vec<u32> = order.par_iter().map(kept_statistics).collect();
         self.statistics.rearrange(&statistics, &[], &mut scratch);
         drop(statistics);
@@ -490,7 +497,7 @@ mod tests {
         for threads in [1, 2] {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             let mut state = before.clone();
-            pool.install(|| state.rebuild(kept.clone(), &[&added[0], &added[1]], &reset, |i| i % 5 == 0));
+            pool.install(|| state.rebuild(kept.clone(), &[&added[0], &added[1]], &reset, |_, i| i % 5 == 0));
             assert_eq!(state.len(), sources.len());
             for (to, from) in order.iter().enumerate() {
                 let (part, i) = sources[*from as usize];

@@ -4,6 +4,7 @@ use crate::event::Event;
 use crate::schedule::plan;
 use crate::trainer::{TrainError, Trainer};
 use crate::transients::{Difference, Hidden};
+use irradia_scene::Pose;
 use irradia_splat::FramePlanes;
 
 /// Fraction of a run after which misfits are left out.
@@ -15,28 +16,40 @@ const TRANSIENTS_AT: [f64; 3] = [0.3, 0.45, 0.6];
 /// of the run.
 const MIN_STEPS_PER_VIEW: f64 = 8.0;
 
+/// The `count` of `others` whose poses are nearest to `pose`, nearest first. A move by `unit` counts as much as a turn by one radian.
+pub(crate) fn nearest<T>(pose: &Pose, others: impl Iterator<Item = (Pose, T)>, count: usize, unit: f32) -> Vec<T> {
+    let mut near: Vec<(f32, T)> = others.map(|(other, of)| (pose.distance(&other, unit), of)).collect();
+    near.sort_by(|a, b| a.0.total_cmp(&b.0));
+    near.truncate(count);
+    near.into_iter().map(|(_, of)| of).collect()
+}
+
 impl Trainer {
     /// Does what is due after a step that began at `before`, in steps of the recipe: leaves out misfits, hides transients.
     pub(crate) fn audit(&mut self, before: f64) -> Result<Vec<Event>, TrainError> {
-        let (total, now) = (self.recipe.total_steps() as f64, self.clock.time);
-        let passes = |at: f64| before < at * total && now >= at * total;
         let mut events = Vec::new();
         if !self.can_render_all_views(1.0) {
             return Ok(events);
         }
-        if self.recipe.drop_misfits && passes(MISFITS_AT) {
+        if self.recipe.drop_misfits && self.passes(before, MISFITS_AT) {
             let errors = self.training_errors()?;
             events.extend(self.leave_out_misfits(&errors));
         }
-        if self.recipe.hide_transients && TRANSIENTS_AT.into_iter().any(passes) {
+        if self.recipe.hide_transients && TRANSIENTS_AT.into_iter().any(|at| self.passes(before, at)) {
             // If the first search finds nothing, there are no later ones.
-            let is_first = passes(TRANSIENTS_AT[0]);
+            let is_first = self.passes(before, TRANSIENTS_AT[0]);
             if is_first || self.hidden.views() > 0 {
                 self.find_transients()?;
             }
             events.extend((is_first && self.hidden.views() > 0).then(|| self.hidden_event()));
         }
         Ok(events)
+    }
+
+    /// Whether the step that began at `before`, in steps of the recipe, passed the fraction `at` of the run.
+    pub(crate) fn passes(&self, before: f64, at: f64) -> bool {
+        let at = at * self.recipe.total_steps() as f64;
+        before < at && self.clock.time >= at
     }
 
     /// Whether the run is long enough to render every training view once more, at `image_scale`.

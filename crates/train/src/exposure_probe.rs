@@ -1,10 +1,12 @@
 //! Whether photographs differ in exposure beyond what a scene can explain, decided early in a run.
 //!
-//! After the first tenth of a run splats show every view's mean colour, in an exposure common to all photographs. Each
-//! photograph's brightness relative to its frame is then its relative exposure. Automatic exposure that follows the view changes
-//! smoothly from camera to camera: splats reproduce it, by spherical harmonics, in held-out views as well. What remains after a prediction
-//! by the nearest cameras fits no scene; splats explain it by veils in front of the cameras.
+//! After the first tenth of a run splats show every view's mean colour, in an exposure common to all photographs. What both halves of a
+//! photograph share of its brightness relative to its frame is then its relative exposure; by how much they differ is the error of early
+//! frames. Automatic exposure that follows the view changes smoothly from camera to camera: splats reproduce it, by spherical harmonics, in
+//! held-out views as well. What remains after a prediction by the nearest cameras, beyond that error, fits no scene; splats explain it by
+//! veils in front of the cameras.
 
+use crate::audit::nearest;
 use crate::event::Event;
 use crate::photos::Prepared;
 use crate::recipe::Choice;
@@ -12,7 +14,7 @@ use crate::robust::spread;
 use crate::schedule::{plan, upcoming_views};
 use crate::socket::Exposure;
 use crate::trainer::{TrainError, Trainer};
-use irradia_scene::Camera;
+use irradia_scene::{Camera, Pose};
 use std::collections::BTreeSet;
 
 /// Fraction of a run after which the decision is made. Later ones cost more than they gain, since splats have to unlearn the exposures:
@@ -68,12 +70,9 @@ type Measured = (Camera, [f64; 2]);
 fn unpredicted(views: &[Measured], i: usize, count: usize, unit: f32) -> [f64; 2] {
     let (camera, own) = &views[i];
     let others = views.iter().enumerate().filter(|(k, _)| *k != i);
-    let mut near: Vec<(f32, &[f64; 2])> = others
-        .map(|(_, (other, logs))| (camera.pose.distance(&other.pose, unit), logs))
-        .collect();
-    near.sort_by(|a, b| a.0.total_cmp(&b.0));
-    near.truncate(count);
-    let predicted = |half: usize| near.iter().map(|(_, logs)| logs[half]).sum::<f64>() / near.len() as f64;
+    let others = others.map(|(_, (other, logs))| (other.pose, logs));
+    let near = nearest(&camera.pose, others, count, unit);
+    let predicted = |half: usize| near.iter().map(|logs| logs[half]).sum::<f64>() / near.len() as f64;
     [0, 1].map(|half| own[half] - predicted(half))
 }
 
@@ -98,11 +97,8 @@ impl Trainer {
     /// Whether exposures are to be decided after a step that began at `before`, in steps of the recipe.
     pub(crate) fn is_exposure_due(&self, before: f64) -> bool {
         // A bilateral grid contains an exposure: there is nothing to decide.
-        if self.recipe.exposure != Choice::Auto || self.sockets.bilateral.is_some() || self.field.is_some() {
-            return false;
-        }
-        let at = PROBE_AT * self.recipe.total_steps() as f64;
-        before < at && self.clock.time >= at
+        let is_open = self.recipe.exposure == Choice::Auto && self.sockets.bilateral.is_none() && self.field.is_none();
+        is_open && self.passes(before, PROBE_AT)
     }
 
     /// The training views to measure: all, or in a short run some with the nearest to each.
@@ -112,16 +108,10 @@ impl Trainer {
         }
         let upcoming = upcoming_views(&self.trained, self.options.seed, &self.clock);
         let groups = upcoming.iter().take(SAMPLED_VIEWS / (1 + NEIGHBOURS));
-        let views: BTreeSet<usize> = groups
-            .flat_map(|view| {
-                let pose = self.camera(*view).pose;
-                let distance = |other: &usize| self.camera(*other).pose.distance(&pose, self.length_unit);
-                let mut nearest = self.trained.clone();
-                nearest.sort_by(|a, b| distance(a).total_cmp(&distance(b)));
-                nearest.truncate(1 + NEIGHBOURS);
-                nearest
-            })
-            .collect();
+        let pose = |view: &usize| self.camera(*view).pose;
+        let poses: Vec<(Pose, usize)> = self.trained.iter().map(|view| (pose(view), *view)).collect();
+        let near = |view: &usize| nearest(&pose(view), poses.iter().copied(), 1 + NEIGHBOURS, self.length_unit);
+        let views: BTreeSet<usize> = groups.flat_map(near).collect();
         views.into_iter().collect()
     }
 

@@ -4,31 +4,31 @@ use crate::free_space::seen_depths;
 use crate::robust::median;
 use crate::trainer::train_cameras;
 use glam::Vec3;
-use irradia_scene::{Dataset, View};
+use irradia_scene::{Camera, Dataset, View};
 use irradia_splat::init;
 use rayon::prelude::*;
 
 /// The width that a pixel covers at the depth of what a training view shows, world units: the median over views, of which there must be at
 /// least one.
 pub(crate) fn pixel_size(dataset: &Dataset) -> f32 {
-    let focus = init::focus_point(&train_cameras(dataset));
-    let size = |view: &usize| {
-        let view = &dataset.views[*view];
-        let camera = &view.camera;
-        let depth = view_depth(dataset, view, focus);
-        f64::from(depth.max(camera.near) / camera.intrinsics.fx.max(camera.intrinsics.fy))
-    };
-    median(dataset.train.par_iter().map(size).collect()) as f32
+    median_over_views(dataset, |camera, depth| {
+        depth / camera.intrinsics.fx.max(camera.intrinsics.fy)
+    })
 }
 
 /// The depth of what a training view shows, world units: the median over views, of which there must be at least one.
 pub(crate) fn content_depth(dataset: &Dataset) -> f32 {
+    median_over_views(dataset, |_, depth| depth)
+}
+
+/// The median of `of` over the training views, by the camera of each and the depth of what it shows.
+fn median_over_views(dataset: &Dataset, of: impl Fn(&Camera, f32) -> f32 + Sync) -> f32 {
     let focus = init::focus_point(&train_cameras(dataset));
-    let depth = |view: &usize| {
+    let value = |view: &usize| {
         let view = &dataset.views[*view];
-        f64::from(view_depth(dataset, view, focus).max(view.camera.near))
+        f64::from(of(&view.camera, view_depth(dataset, view, focus).max(view.camera.near)))
     };
-    median(dataset.train.par_iter().map(depth).collect()) as f32
+    median(dataset.train.par_iter().map(value).collect()) as f32
 }
 
 /// The median depth of the points that a view sees, else the geometric mean of its depth bounds, else the distance of the cameras' `focus`.

@@ -173,7 +173,7 @@ fn begin_events(trainer: &mut Trainer) -> Vec<Event> {
             step: 0,
             seconds: 0.0,
         });
-    } else if trainer.memory.splats < trainer.recipe.max_splats {
+    } else {
         // Resumed with less memory than that with which the recipe got its limit.
         let warning = trainer.memory.warning(&trainer.recipe.name);
         events.extend(warning.map(|message| Event::Warned { message }));

@@ -8,12 +8,14 @@
 //! they are compared with those of other photographs at the same place: no fraction of outliers has to be assumed, and where there are
 //! none, nothing is hidden.
 
+use crate::audit::nearest;
 use crate::photos::Prepared;
 use glam::{Vec2, Vec3};
 use irradia_scene::{Camera, Intrinsics};
 use irradia_splat::FramePlanes;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
+use std::ops::Range;
 
 /// Blocks along the longer side of a photograph.
 const LONG_SIDE_BLOCKS: u32 = 48;
@@ -74,6 +76,15 @@ impl Grid {
         pixel * blocks / pixels
     }
 
+    /// The columns and rows of pixels of `block` in an image of this size.
+    fn pixels(self, block: usize, width: usize, height: usize) -> [Range<usize>; 2] {
+        [
+            (block % self.columns, self.columns, width),
+            (block / self.columns, self.rows, height),
+        ]
+        .map(|(at, blocks, side)| Self::start(at, blocks, side)..Self::start(at + 1, blocks, side))
+    }
+
     /// The blocks around `block`, and itself.
     fn around(self, block: usize) -> impl Iterator<Item = usize> {
         let (column, row) = (block % self.columns, block / self.columns);
@@ -103,11 +114,7 @@ impl Difference {
         let pixels = width * height;
         let grid = Grid::from_intrinsics(&camera.intrinsics);
         let block = |i: usize| {
-            let [columns, rows] = [
-                (i % grid.columns, grid.columns, width),
-                (i / grid.columns, grid.rows, height),
-            ]
-            .map(|(at, blocks, side)| Grid::start(at, blocks, side)..Grid::start(at + 1, blocks, side));
+            let [columns, rows] = grid.pixels(i, width, height);
             let (mut color, mut photo_color, mut depth, mut alpha, mut count) =
                 ([0.0f32; 3], [0.0; 3], 0.0, 0.0, 0.0f32);
             for at in rows.flat_map(|y| columns.clone().map(move |x| y * width + x)) {
@@ -203,17 +210,12 @@ impl Hidden {
     /// `length_unit` counts as much as a turn by one radian.
     pub fn find(views: &[(usize, Difference)], length_unit: f32, already: &Self) -> Self {
         let found = |(view, own): &(usize, Difference)| {
-            let mut others: Vec<(f32, usize)> = views
-                .iter()
-                .enumerate()
-                .filter(|(_, (other, _))| other != view)
-                .map(|(i, (_, other))| (own.camera.pose.distance(&other.camera.pose, length_unit), i))
-                .collect();
-            others.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-            others.truncate(MAX_WITNESSES);
+            let others = views.iter().enumerate().filter(|(_, (other, _))| other != view);
+            let others = others.map(|(i, (_, other))| (other.camera.pose, i));
+            let others = nearest(&own.camera.pose, others, MAX_WITNESSES, length_unit);
             let excess = |i: usize| {
                 let place = own.place(i);
-                let witness = |(_, other): &(f32, usize)| {
+                let witness = |other: &usize| {
                     let (view, difference) = &views[*other];
                     let block = difference.sees(place)?;
                     (!already.contains(*view, block)).then_some((difference.color[block], difference.photo[block]))
@@ -256,20 +258,15 @@ impl Hidden {
         let blocks = self.0.get(&view)?;
         let grid = Grid::from_intrinsics(&camera.intrinsics);
         let (width, height) = (photo.width as usize, photo.height as usize);
-        let mut mask = photo.mask.clone().unwrap_or_else(|| vec![255; width * height]);
-        let columns: Vec<usize> = (0..width).map(|x| Grid::block(x, grid.columns, width)).collect();
-        for (y, row) in mask.chunks_exact_mut(width).enumerate() {
-            let blocks = &blocks[Grid::block(y, grid.rows, height) * grid.columns..];
-            for (value, column) in row.iter_mut().zip(&columns) {
-                if blocks[*column] {
-                    *value = 0;
-                }
+        let mut shown = photo.clone();
+        let mask = shown.mask.get_or_insert_with(|| vec![255; width * height]);
+        for (block, _) in blocks.iter().enumerate().filter(|(_, hidden)| **hidden) {
+            let [columns, rows] = grid.pixels(block, width, height);
+            for y in rows {
+                mask[y * width..][columns.clone()].fill(0);
             }
         }
-        Some(Prepared {
-            mask: Some(mask),
-            ..photo.clone()
-        })
+        Some(shown)
     }
 
     /// For a checkpoint: view number and block number of every hidden block.

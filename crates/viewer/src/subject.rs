@@ -141,18 +141,15 @@ impl Subject {
                 .ok(),
             (None, None) => None,
         };
-        let cameras = scene.cameras.clone();
+        let cameras = scene.cameras.as_deref().unwrap_or_default();
         let views = match dataset {
             Some(dataset) => {
                 warnings.extend(dataset.warnings.iter().cloned());
                 let names = camera_names(&file).unwrap_or_default();
-                let cameras = cameras.iter().flat_map(|cameras| cameras.iter());
-                Views::of_dataset(
-                    &dataset,
-                    &names.into_iter().zip(cameras.map(|camera| camera.pose)).collect(),
-                )
+                let poses = cameras.iter().map(|camera| camera.pose);
+                Views::of_dataset(&dataset, &names.into_iter().zip(poses).collect())
             }
-            None => Views::of_cameras(cameras.as_deref().unwrap_or(&[])),
+            None => Views::of_cameras(cameras),
         };
         // Lights are numbered by the views of the run's own dataset.
         let lights = if data.is_none() { read_lights(&file) } else { Ok(None) };

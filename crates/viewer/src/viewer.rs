@@ -8,7 +8,7 @@ use crate::notices::{LineSink, Notices};
 use crate::serve::{Shared, router};
 use crate::{Subject, ViewerError};
 use serde_json::json;
-use std::io;
+use std::fmt::Display;
 use std::sync::Arc;
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
@@ -27,21 +27,24 @@ pub struct Viewer {
     threads: Vec<JoinHandle<()>>,
 }
 
+/// The system does not give what a viewer needs.
+fn refused(error: impl Display) -> ViewerError {
+    ViewerError::Start(error.to_string())
+}
+
 impl Viewer {
     /// Serves `subject`. `sink` receives lines for the user of the program, such as each kind of refused request once.
     ///
     /// # Errors
     /// When no address can be listened on, or the system refuses threads or random numbers.
     pub fn start(subject: Subject, listen: &Listen, sink: LineSink) -> Result<Self, ViewerError> {
-        let refused = |error: io::Error| ViewerError::Start(error.to_string());
-        let not_random = |error: getrandom::Error| ViewerError::Start(error.to_string());
         let notices = Arc::new(Notices::new(sink));
         let listener = listen.bind()?;
         let bound = listener.local_addr().map_err(refused)?;
         let token = if bound.ip().is_loopback() {
             None
         } else {
-            Some(random_token().map_err(not_random)?)
+            Some(random_token().map_err(refused)?)
         };
         let query = token
             .as_ref()
@@ -54,7 +57,7 @@ impl Viewer {
             host: listen.host.clone(),
             token,
         };
-        let shared = Arc::new(Shared::new(subject, guard, notices.clone()).map_err(not_random)?);
+        let shared = Arc::new(Shared::new(subject, guard, notices.clone()).map_err(refused)?);
         if let Some(live) = &shared.subject.live {
             let weak = Arc::downgrade(&shared);
             let wake = move || {
@@ -71,7 +74,7 @@ impl Viewer {
             .num_threads(rayon::current_num_threads())
             .thread_name(|i| format!("draw-{i}"))
             .build()
-            .map_err(|error| ViewerError::Start(error.to_string()))?;
+            .map_err(refused)?;
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_all()
             .max_blocking_threads(4)

@@ -36,7 +36,7 @@ pub(super) fn relative_name(root: &Path, path: &Path) -> String {
 }
 
 /// Whether a file's name is that of an image.
-pub(crate) fn is_image_name(path: &Path) -> bool {
+pub fn is_image_name(path: &Path) -> bool {
     let extension = path.extension().map(|e| e.to_string_lossy().to_lowercase());
     extension.is_some_and(|e| IMAGE_EXTENSIONS.contains(&e.as_str()))
 }

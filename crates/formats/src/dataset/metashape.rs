@@ -82,8 +82,7 @@ pub(crate) fn parse_metashape(bytes: &[u8]) -> Result<Vec<MetashapeCamera>, Malf
         if let (Some(id), Some("spherical")) = (sensor.attribute("id"), sensor.attribute("type")) {
             sensors.insert(id, (DeclaredCamera::panorama(), false));
         } else if let (Some(id), Some(calibration)) = (sensor.attribute("id"), calibration(sensor)) {
-            let is_skewed = number(calibration, "b2").is_some_and(|b2| b2 != 0.0);
-            sensors.insert(id, (intrinsics(sensor, calibration)?, is_skewed));
+            sensors.insert(id, intrinsics(sensor, calibration)?);
         }
     }
     let world_from_chunk = chunk.child("transform").and_then(transform);
@@ -158,12 +157,8 @@ fn transform(element: &Element) -> Option<Transform> {
     })
 }
 
-/// A parameter of a calibration.
-fn number(calibration: &Element, name: &str) -> Option<f64> {
-    calibration.child(name)?.numbers().first().copied()
-}
-
-fn intrinsics(sensor: &Element, calibration: &Element) -> Result<DeclaredCamera, Malformed> {
+/// The intrinsics, and whether the columns of pixels are not perpendicular to the rows, which the intrinsics cannot say.
+fn intrinsics(sensor: &Element, calibration: &Element) -> Result<(DeclaredCamera, bool), Malformed> {
     let resolution = calibration.child("resolution").or_else(|| sensor.child("resolution"));
     let side = |name: &str| -> Option<f64> { resolution?.attribute(name)?.parse().ok() };
     let size = side("width")
@@ -172,7 +167,7 @@ fn intrinsics(sensor: &Element, calibration: &Element) -> Result<DeclaredCamera,
     let Some((width, height)) = size else {
         return Err(Malformed("a sensor has no resolution".into()));
     };
-    let number = |name: &str| number(calibration, name);
+    let number = |name: &str| calibration.child(name)?.numbers().first().copied();
     let coefficient = |name: &str| number(name).unwrap_or(0.0);
     let kind = calibration
         .attribute("type")
@@ -215,12 +210,13 @@ fn intrinsics(sensor: &Element, calibration: &Element) -> Result<DeclaredCamera,
         ),
         (None, None) => return Err(Malformed("a sensor's calibration has no <f>".into())),
     };
-    Ok(DeclaredCamera {
+    let camera = DeclaredCamera {
         size: Some([width, height]),
         focal: Focal::Pixels(focal),
         center: Some(center),
         lens: lens_or_pinhole(lens),
-    })
+    };
+    Ok((camera, coefficient("b2") != 0.0))
 }
 
 #[cfg(test)]

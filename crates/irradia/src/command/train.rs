@@ -161,7 +161,9 @@ pub fn run(args: &Args) -> Result<()> {
         (None, None) => {
             let mut input = input(args)?;
             if let Some(from) = &args.from {
-                keep_poses_of(from, &mut input, args.poses)?;
+                let (request, dataset) = with_poses_of(from, input, args.poses)?;
+                RunFolder::check_free(&request.input().out, request.input().overwrite)?;
+                return begin_on(request, dataset, args.viewer());
             }
             if is_unposed(&input.data) {
                 // Posing takes a while: mistakes are reported first.
@@ -246,32 +248,36 @@ fn input(args: &Args) -> Result<TrainInput> {
     })
 }
 
-/// Makes sure that `input` does not combine splats of the scene `from` with new poses, which are in a world of their own. If the photographs
+/// The dataset of `input` with poses that the splats of the scene `from` fit: new ones would be in a world of their own. If the photographs
 /// of the run that contains `from` were posed for it, they replace photographs without poses or with others.
-fn keep_poses_of(from: &Path, input: &mut TrainInput, poses: Option<PosesArg>) -> Result<()> {
-    let (scene, data) = (from.display(), input.data.display());
+fn with_poses_of(from: &Path, mut input: TrainInput, poses: Option<PosesArg>) -> Result<(TrainRequest, Dataset)> {
+    let (scene, data) = (from.display(), input.data.display().to_string());
     if poses.and_then(PosesArg::mapper).is_some() {
         let message = format!("--poses: new poses do not fit the splats of {scene}: omit it, or omit --from");
         return Err(Usage(message).into());
     }
-    let is_unposed = is_unposed(&input.data);
-    if !is_unposed && moved_from_dataset(&scene_path(from), &read(input.clone())?.1).is_some() {
-        return Ok(());
+    let given = (!is_unposed(&input.data)).then(|| read(input.clone())).transpose()?;
+    let fits = |dataset: &Dataset| moved_from_dataset(&scene_path(from), dataset).is_some();
+    match (given, RunFolder::posed_dataset(from)) {
+        (Some(given), _) if fits(&given.1) => Ok(given),
+        (_, Some(posed)) => {
+            note(format_args!(
+                "the splats of {scene} fit the poses in {}, which replace {data}",
+                posed.display()
+            ));
+            input.data = posed;
+            (input.reading.format, input.reading.images) = (None, None);
+            read(input)
+        }
+        // Other poses are refused when the run begins.
+        (Some(given), None) => Ok(given),
+        (None, None) => {
+            let message = format!(
+                "{data} has no poses, and new ones do not fit the splats of {scene}: name the dataset on which it was trained"
+            );
+            Err(Usage(message).into())
+        }
     }
-    if let Some(posed) = RunFolder::posed_dataset(from) {
-        note(format_args!(
-            "the splats of {scene} fit the poses in {}, which replace {data}",
-            posed.display()
-        ));
-        input.data = posed;
-        (input.reading.format, input.reading.images) = (None, None);
-    } else if is_unposed {
-        let message = format!(
-            "{data} has no poses, and new ones do not fit the splats of {scene}: name the dataset on which it was trained"
-        );
-        return Err(Usage(message).into());
-    }
-    Ok(())
 }
 
 /// The dataset of `input`, whose photographs have poses: with the given poses, or with new ones if they are requested or the photographs
@@ -284,9 +290,8 @@ fn with_poses(input: TrainInput, poses: Option<PosesArg>, anyway: bool) -> Resul
         pose_again(&mut again, &given.1, mapper, anyway)?;
         return read(again);
     }
-    // Rendered scenes are exact, our own poses have been checked, and the splats of --from are in the world of the given poses.
-    let is_sure =
-        given.1.kind == "Blender" || pose_source(&input.data) == Some(PoseSource::Irradia) || input.from.is_some();
+    // Rendered scenes are exact, and our own poses have been checked.
+    let is_sure = given.1.kind == "Blender" || pose_source(&input.data) == Some(PoseSource::Irradia);
     if poses.is_some() || is_sure {
         return Ok(given);
     }

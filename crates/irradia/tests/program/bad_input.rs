@@ -5,13 +5,6 @@ use serde_json::{Value, json as value};
 use std::fs;
 use std::path::Path;
 
-/// Edits a JSON file.
-fn edit(path: &Path, change: impl FnOnce(&mut Value)) {
-    let mut content = json(path);
-    change(&mut content);
-    fs::write(path, content.to_string()).expect("written");
-}
-
 /// Asserts that training on `data` fails with exit code 1 and `words`, and creates no run.
 fn data_refused(folder: &Path, words: &[&str]) {
     irradia(folder, "train data --out run --steps 5").refused(1, words);

@@ -85,15 +85,14 @@ fn splats_are_trained_further_with_the_poses_of_their_run() {
     irradia(folder.path(), "train run/posed --out run --steps 2").success();
     irradia(folder.path(), "synth data --views 8 --size 48x48").success();
     // The given poses: each photograph has that of another.
-    let path = here("data/transforms_train.json");
-    let mut transforms = json(&path);
-    let frames = transforms["frames"].as_array_mut().expect("frames");
-    let mut poses: Vec<_> = frames.iter().map(|frame| frame["transform_matrix"].clone()).collect();
-    poses.rotate_left(1);
-    for (frame, pose) in frames.iter_mut().zip(poses) {
-        frame["transform_matrix"] = pose;
-    }
-    fs::write(&path, transforms.to_string()).expect("written");
+    edit(&here("data/transforms_train.json"), |transforms| {
+        let frames = transforms["frames"].as_array_mut().expect("frames");
+        let mut poses: Vec<_> = frames.iter().map(|frame| frame["transform_matrix"].clone()).collect();
+        poses.rotate_left(1);
+        for (frame, pose) in frames.iter_mut().zip(poses) {
+            frame["transform_matrix"] = pose;
+        }
+    });
     let ended = irradia(folder.path(), "train data --from run --out again --steps 2").success();
     assert!(ended.stderr.contains("fit the poses in run/posed"), "{ended:?}");
     let record = json(&here("again/run.json"));

@@ -180,3 +180,10 @@ pub fn events(run: &Path) -> Vec<Value> {
 pub fn scene(run: &Path) -> Vec<u8> {
     fs::read(run.join("scene.ply")).expect("a scene")
 }
+
+/// Edits a JSON file.
+pub fn edit(path: &Path, change: impl FnOnce(&mut Value)) {
+    let mut content = json(path);
+    change(&mut content);
+    fs::write(path, content.to_string()).expect("written");
+}

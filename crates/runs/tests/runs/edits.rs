@@ -30,6 +30,18 @@ fn edited(input: &Path, lines: &[&str]) -> Editing {
     editing
 }
 
+/// The mean PSNR of held-out views, dB.
+fn held_out_psnr(scene: &Scene, data: &Dataset) -> Result<f64, RunError> {
+    let options = EvalOptions {
+        render: scene.options,
+        metrics: Metrics::Psnr,
+        half_fit: HalfFit::default(),
+        vignette: None,
+        device: &irradia_compute::Device::Cpu,
+    };
+    evaluate(&scene.model, data, &data.test, &options, |_| Ok::<(), RunError>(())).map(|mean| mean.psnr)
+}
+
 #[test]
 fn a_folder_gets_the_scene_its_moved_cameras_and_the_edits() {
     let folder = folder();
@@ -262,14 +274,7 @@ fn cameras_follow_moved_scenes_and_splats_are_not_trained_on_other_poses() {
         let path = here(name);
         let scene = Scene::read(&path)?;
         let data = ReadingOptions::default().read_for(&scene, &path, &here("photos"))?;
-        let options = EvalOptions {
-            render: scene.options,
-            metrics: Metrics::Psnr,
-            half_fit: HalfFit::default(),
-            vignette: None,
-            device: &irradia_compute::Device::Cpu,
-        };
-        evaluate(&scene.model, &data, &data.test, &options, |_| Ok::<(), RunError>(())).map(|mean| mean.psnr)
+        held_out_psnr(&scene, &data)
     };
     let begin_from = |name: &str| {
         let from = TrainInput {
@@ -362,15 +367,7 @@ fn floaters_planted_in_a_trained_scene_are_removed() {
     let psnr = |cloud: &GaussianCloud| {
         write_splats(&path, cloud).unwrap();
         let scene = Scene::read(&path).unwrap();
-        let options = EvalOptions {
-            render: scene.options,
-            metrics: Metrics::Psnr,
-            half_fit: HalfFit::default(),
-            vignette: None,
-            device: &irradia_compute::Device::Cpu,
-        };
-        let mean = evaluate(&scene.model, &data, &data.test, &options, |_| Ok::<(), RunError>(()));
-        mean.expect("photographs").psnr
+        held_out_psnr(&scene, &data).expect("photographs")
     };
     let (as_trained, with, after) = (psnr(&clean), psnr(&planted), psnr(left));
     assert!(

@@ -18,7 +18,7 @@ pub(super) fn settings(evidence: &Evidence) -> Vec<Diagnosis> {
         .photos
         .iter()
         .enumerate()
-        .filter_map(|(i, photo)| Some((photo.focal_prior_px? / f64::from(photo.width.max(photo.height)), i)))
+        .filter_map(|(i, photo)| Some((photo.focal_prior_px? / photo.long_side(), i)))
         .filter(|(focal, _)| focal.is_finite() && *focal > 0.0)
         .collect();
     known.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));

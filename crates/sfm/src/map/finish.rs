@@ -4,10 +4,10 @@ use super::Input;
 use super::model::GrowingModel;
 use super::types::{LeftOut, Model, ModelPoint, PairKind, PhotoInfo, Reason, VerifiedPair};
 use crate::geometry::align::Alignment;
-use crate::geometry::pose::DPose;
-use crate::upright::{survey, up};
+use crate::upright::up;
 use crate::{PairMatches, median};
 use glam::{DQuat, DVec3};
+use irradia_scene::survey;
 
 /// The model in its final, upright world.
 pub(super) fn finish(growing: &GrowingModel, photos: &[PhotoInfo]) -> Model {
@@ -62,7 +62,8 @@ pub(super) fn extract_model(growing: &GrowingModel, photos: &[PhotoInfo]) -> Mod
 fn upright(model: &Model, photos: &[PhotoInfo]) -> Alignment {
     let cameras = photos.iter().zip(&model.poses);
     let mean_up = || up(cameras.filter_map(|(photo, pose)| Some((pose.as_ref()?.rotation, photo.up))));
-    let poses: Vec<DPose> = model.poses.iter().flatten().copied().collect();
+    let poses = model.poses.iter().flatten().map(|pose| (pose.rotation, pose.position));
+    let poses: Vec<(DQuat, DVec3)> = poses.collect();
     let points = model.points.iter().map(|point| point.position);
     let is_up_unknown = photos.iter().all(|photo| photo.up.is_none());
     let survey = survey(&poses, points).filter(|_| is_up_unknown);

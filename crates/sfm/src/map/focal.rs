@@ -2,7 +2,7 @@
 
 use super::Unverified;
 use super::types::{GroupCamera, PhotoInfo};
-use super::verify::{Cameras, UncalibratedPair, centered_points, essential_from, long_side, select};
+use super::verify::{Cameras, UncalibratedPair, centered_points, essential_from, select};
 use crate::geometry::correspondences::Correspondences;
 use crate::geometry::essential::{motions, refine_motion};
 use glam::{DMat3, DVec2};
@@ -43,7 +43,7 @@ const MAX_SIMILAR_RATIO: f64 = 1.02;
 const MAX_ADJUSTMENT_RATIO: f64 = 3.0;
 /// Maximum number of pairs that vote, those with most inliers.
 const MAX_VOTING_PAIRS: usize = 40;
-/// Number of pairs of photographs with metadata from which the voting ones are selected.
+/// Maximum number of pairs of known focal lengths whose fundamental matrices are estimated, to check these.
 pub(super) const MAX_CHECKED_PAIRS: usize = 120;
 /// Maximum number of points of each pair that votes.
 const MAX_VOTING_POINTS: usize = 300;
@@ -68,7 +68,7 @@ pub(super) fn cameras(unverified: &Unverified, uncalibrated: &[&UncalibratedPair
             let Some(first) = members.first() else {
                 return GroupCamera::centered(1, 1, 1.0, FocalSource::Guess);
             };
-            let long_side = long_side(first);
+            let long_side = first.long_side();
             let mut priors: Vec<f64> = members.iter().filter_map(|p| p.focal_prior_px).collect();
             priors.sort_by(f64::total_cmp);
             let prior = priors.get(priors.len() / 2).map(|prior| prior / long_side);
@@ -173,7 +173,7 @@ impl VotingPair {
             matrix: uncalibrated.matrix,
             points: points.into_iter().step_by(step).collect(),
             // A quarter of the threshold: the remaining errors are those of the model, not wrong matches.
-            threshold: 0.25 * options.max_epipolar_error / long_side(first),
+            threshold: 0.25 * options.max_epipolar_error / first.long_side(),
         }
     }
 

@@ -7,7 +7,7 @@
 use super::model::GrowingModel;
 use super::tracks::Tracks;
 use super::types::{KnownGeometry, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, VerifiedPair};
-use super::verify::{inverse_calibration, long_side};
+use super::verify::inverse_calibration;
 use super::{exact_camera, finish, verify};
 use crate::geometry::camera::DCamera;
 use crate::geometry::essential::Motion;
@@ -15,6 +15,7 @@ use crate::geometry::pose::DPose;
 use crate::matching::{MatchOptions, TwoViewGeometry, match_guided};
 use crate::{Features, Keypoint};
 use glam::{DMat3, DVec2, DVec3};
+use irradia_scene::Lens;
 use rayon::prelude::*;
 use std::borrow::Cow;
 use std::collections::HashSet;
@@ -107,10 +108,10 @@ impl PinholePhoto {
 
 /// Features at the pixels at which a camera without distortion would show them.
 pub(super) fn pinhole_features<'a>(features: &'a Features, camera: &DCamera) -> Cow<'a, Features> {
-    let [fx, fy, cx, cy, distortion @ ..] = camera.parameters;
-    if !camera.fisheye && distortion.iter().all(|k| *k == 0.0) {
+    if camera.lens() == Lens::Pinhole {
         return Cow::Borrowed(features);
     }
+    let [fx, fy, cx, cy, ..] = camera.parameters;
     let place = |keypoint: &Keypoint| {
         // Keypoints that no pinhole camera shows are moved far away from all lines.
         let at = camera.unproject(keypoint.at()).unwrap_or(DVec2::splat(1e6));
@@ -213,7 +214,7 @@ fn has_consistent_depth(
         let Some((at, depth)) = position_and_depth(point, *observation, features, model) else {
             return false;
         };
-        let radius = NEIGHBOUR_RADIUS * long_side(photo);
+        let radius = NEIGHBOUR_RADIUS * photo.long_side();
         let mut neighbours: Vec<(f64, f64)> = depths[observation.0 as usize]
             .iter()
             .map(|(other, depth)| (other.distance_squared(at), *depth))

@@ -125,8 +125,7 @@ pub fn reconstruct(
     }
     found = zoom::split_cameras(&input, found, progress);
     // Puts each photograph into the group of its own camera, where it has one.
-    let mut grouped = photos.to_vec();
-    found.regroup(&mut grouped);
+    let grouped = found.regrouped(photos);
     if let Some(model) = principal::with_free_principal_points(&grouped, features, &found, options, progress) {
         found.models[0] = model;
     }
@@ -304,8 +303,7 @@ pub fn complete(
     options: &MapOptions,
     progress: &mut dyn FnMut(Progress),
 ) -> Reconstruction {
-    let mut photos = photos.to_vec();
-    found.regroup(&mut photos);
+    let photos = found.regrouped(photos);
     let (largest, others) = found.models.split_first().expect("a model");
     let mut completed = extend(&photos, features, pairs, &largest.into(), options, progress);
     let poses = &completed.models[0].poses;

@@ -313,18 +313,18 @@ impl GrowingModel<'_> {
         loop {
             let mut solved = problem.clone();
             let report = solved.solve(options);
-            let mut is_plausible = true;
-            for (group, solved) in solved.cameras.iter().enumerate() {
-                let is_free = solved.freedom != Freedom::HELD;
-                if is_free && !has_plausible_values(&solved.camera, self.initial_focals[group]) {
-                    problem.cameras[group].freedom = Freedom::HELD;
-                    self.focal_held[group] = true;
-                    is_plausible = false;
-                }
-            }
-            if is_plausible {
+            let is_implausible = |group: &usize| {
+                let AdjustedCamera { camera, freedom, .. } = &solved.cameras[*group];
+                *freedom != Freedom::HELD && !has_plausible_values(camera, self.initial_focals[*group])
+            };
+            let implausible: Vec<usize> = (0..solved.cameras.len()).filter(is_implausible).collect();
+            if implausible.is_empty() {
                 *problem = solved;
                 return report;
+            }
+            for group in implausible {
+                problem.cameras[group].freedom = Freedom::HELD;
+                self.focal_held[group] = true;
             }
         }
     }

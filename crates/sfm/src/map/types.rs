@@ -34,6 +34,13 @@ pub struct PhotoInfo {
     pub mount: Option<RigMount>,
 }
 
+impl PhotoInfo {
+    /// The longer side, px.
+    pub(crate) fn long_side(&self) -> f64 {
+        f64::from(self.width.max(self.height))
+    }
+}
+
 /// The camera of a group before any adjustment.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct GroupCamera {
@@ -238,8 +245,7 @@ impl Reconstruction {
         let Some(model) = self.models.first().filter(|_| few) else {
             return 0;
         };
-        let mut photos = photos.to_vec();
-        self.regroup(&mut photos);
+        let photos = self.regrouped(photos);
         let agreement = agreement(&photos, features, &self.pairs, model);
         contradictions(&self.pairs, &strengths(&photos, features, &self.pairs), &agreement).len()
     }
@@ -253,6 +259,13 @@ impl Reconstruction {
         let matched: BTreeSet<[u32; 2]> = matched.iter().map(|pair| pair.photos).collect();
         let pairs = self.missing.iter().map(|pair| pair.photos);
         pairs.filter(|pair| !matched.contains(pair)).collect()
+    }
+
+    /// `photos` with the groups by which `cameras` and the cameras of the models are indexed.
+    pub fn regrouped(&self, photos: &[PhotoInfo]) -> Vec<PhotoInfo> {
+        let mut photos = photos.to_vec();
+        self.regroup(&mut photos);
+        photos
     }
 
     /// Sets the groups of `photos` to those by which `cameras` and the cameras of the models are indexed.

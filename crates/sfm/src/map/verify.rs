@@ -133,17 +133,12 @@ fn pixel(features: &Features, keypoint: u32) -> DVec2 {
     features.keypoints[keypoint as usize].at()
 }
 
-/// The longer side of a photograph, px.
-pub(super) fn long_side(photo: &PhotoInfo) -> f64 {
-    f64::from(photo.width.max(photo.height))
-}
-
 /// Points of a pair, centred and divided by each photograph's long side.
 pub(crate) fn centered_points(photos: &[PhotoInfo], features: &[Features], pair: &PairMatches) -> Vec<[DVec2; 2]> {
     let centered = |side: usize, keypoint: u32| {
         let photo = &photos[pair.photos[side] as usize];
         let center = 0.5 * DVec2::new(f64::from(photo.width), f64::from(photo.height));
-        (pixel(&features[pair.photos[side] as usize], keypoint) - center) / long_side(photo)
+        (pixel(&features[pair.photos[side] as usize], keypoint) - center) / photo.long_side()
     };
     pair.matches
         .iter()
@@ -159,7 +154,7 @@ fn estimate_fundamental(
     options: &MapOptions,
 ) -> Option<UncalibratedPair> {
     let points = Correspondences::new(centered_points(photos, features, pair));
-    let [a, b] = pair.photos.map(|p| long_side(&photos[p as usize]));
+    let [a, b] = pair.photos.map(|p| photos[p as usize].long_side());
     let threshold = options.max_epipolar_error * 0.5 * (1.0 / a + 1.0 / b);
     let limits = Limits {
         samples: MAX_SAMPLES,
@@ -244,7 +239,7 @@ fn verify_calibrated(
         seed: seed_of(pair),
     };
     let first = uncalibrated.map(|u| {
-        let [a, b] = pair.photos.map(|p| long_side(&photos[p as usize]));
+        let [a, b] = pair.photos.map(|p| photos[p as usize].long_side());
         essential_from(u.matrix, camera_a.focal() / a, camera_b.focal() / b)
     });
     let best = estimate(&problem, first.into_iter().collect(), limits)?;
@@ -319,7 +314,7 @@ pub(super) fn inverse_calibration(camera: &DCamera) -> DMat3 {
 
 /// Maps homogeneous pixels to the coordinates of [`centered_points`].
 fn to_centered(photo: &PhotoInfo) -> DMat3 {
-    let scale = 1.0 / long_side(photo);
+    let scale = 1.0 / photo.long_side();
     let center = 0.5 * scale * DVec2::new(f64::from(photo.width), f64::from(photo.height));
     DMat3::from_cols(DVec3::X * scale, DVec3::Y * scale, (-center).extend(1.0))
 }

@@ -59,8 +59,7 @@ pub(super) fn split_cameras(
     progress: &mut dyn FnMut(Progress),
 ) -> Reconstruction {
     while found.zooms.len() < MAX_ZOOMS {
-        let mut grouped = input.photos.to_vec();
-        found.regroup(&mut grouped);
+        let mut grouped = found.regrouped(input.photos);
         let largest = found.models.first();
         let distribution = largest.map(|model| focal_distribution(&grouped, input.features, model));
         let clustered = match distribution {
@@ -283,19 +282,21 @@ fn own_focals(photos: &[PhotoInfo], features: &[Features], model: &Model, max_ca
     let mut focals = vec![f64::NAN; photos.len()];
     let (mut cost_before, mut cost_after) = (0.0, 0.0);
     let parts = model.registered().div_ceil(max_cameras);
-    for part in 0..parts {
-        let mut number = vec![usize::MAX; photos.len()];
-        let members = posed(model).skip(part).step_by(parts).enumerate();
-        members.for_each(|(i, photo)| number[photo] = i);
-        let part = part_of(model, |photo| number[photo] != usize::MAX);
+    for first in 0..parts {
+        let members: Vec<usize> = posed(model).skip(first).step_by(parts).collect();
+        let number = |photo: usize| members.binary_search(&photo);
+        let part = part_of(model, |photo| number(photo).is_ok());
         let camera = |photo: usize| model.cameras[photos[photo].group].as_ref();
-        let cameras = posed(&part).map(|photo| own_camera(camera(photo).expect("a posed photograph has a camera")));
-        let mut problem = readjust::problem(photos, features, &part, cameras.collect(), |photo| number[photo]);
+        let own = |photo: &usize| own_camera(camera(*photo).expect("a posed photograph has a camera"));
+        let cameras = members.iter().map(own).collect();
+        let mut problem = readjust::problem(photos, features, &part, cameras, |photo| {
+            number(photo).expect("only members are posed")
+        });
         let report = problem.solve(&readjust::OPTIONS);
         cost_before += report.initial_cost;
         cost_after += report.final_cost;
-        for photo in posed(&part) {
-            focals[photo] = problem.cameras[number[photo]].camera.focal();
+        for (photo, adjusted) in members.iter().zip(&problem.cameras) {
+            focals[*photo] = adjusted.camera.focal();
         }
     }
     (focals, readjust::cost_reduction(cost_before, cost_after))
@@ -305,12 +306,8 @@ fn own_focals(photos: &[PhotoInfo], features: &[Features], model: &Model, max_ca
 fn part_of(model: &Model, is_member: impl Fn(usize) -> bool) -> Model {
     let pose = |photo: usize| model.poses[photo].filter(|_| is_member(photo));
     let point = |point: &ModelPoint| {
-        let track = point
-            .track
-            .iter()
-            .copied()
-            .filter(|(photo, _)| is_member(*photo as usize));
-        let track: Vec<(u32, u32)> = track.collect();
+        let mut track = point.track.clone();
+        track.retain(|(photo, _)| is_member(*photo as usize));
         (track.len() >= 2).then_some(ModelPoint { track, ..*point })
     };
     Model {

@@ -6,7 +6,7 @@ use glam::{DQuat, DVec2, DVec3};
 use irradia_scene::Rng;
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::geometry::pose::DPose;
-use irradia_sfm::map::{MapOptions, Model, PhotoInfo, Reconstruction, reconstruct};
+use irradia_sfm::map::{KnownGeometry, MapOptions, Model, PhotoInfo, Reconstruction, extend, reconstruct};
 use irradia_sfm::{Features, Keypoint, PairMatches};
 
 /// Photographs, features and matches with known cameras.
@@ -215,6 +215,12 @@ impl World {
             matches: p.matches,
         }));
         self
+    }
+
+    /// Like [`Self::map`], beginning with what is known.
+    pub fn extend(&self, known: &KnownGeometry) -> Reconstruction {
+        let options = MapOptions::default();
+        extend(&self.photos, &self.features, &self.pairs, known, &options, &mut |_| ())
     }
 
     pub fn map(&self) -> Reconstruction {

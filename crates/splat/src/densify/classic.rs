@@ -59,7 +59,7 @@ pub fn densify(state: &mut SplatState, options: &ClassicOptions, rng: &mut Rng) 
         }
     }
     let left = without((0..n as u32).collect(), &split);
-    state.rebuild(left, &[&clones, &halves], &[], |_| false);
+    state.rebuild(left, &[&clones, &halves], &[], |_, _| false);
     DensityChange {
         cloned: clone.len(),
         split: split.len(),

@@ -9,6 +9,7 @@
 use super::DensityChange;
 use super::split::{indices, is_finite, long_axis_halves, without};
 use crate::SplatState;
+use irradia_compute::Planes;
 use rayon::prelude::*;
 
 /// Options.
@@ -66,9 +67,8 @@ pub fn densify(state: &mut SplatState, options: &FastOptions) -> DensityChange {
     let mut split: Vec<u32> = wanted.into_iter().map(|(_, i)| i).collect();
     split.par_sort_unstable();
     let halves = long_axis_halves(&state.splats, &split);
-    let seen = &state.statistics.plane(SplatState::SEEN)[..n];
-    let rarely_seen: Vec<bool> = seen.iter().map(|frames| *frames < MIN_FRAMES).collect();
-    state.rebuild(without(kept, &split), &[&halves], &[], |i| rarely_seen[i as usize]);
+    let is_rare = |statistics: &Planes, i: u32| statistics.get(SplatState::SEEN, i as usize) < MIN_FRAMES;
+    state.rebuild(without(kept, &split), &[&halves], &[], is_rare);
     DensityChange {
         cloned: 0,
         split: split.len(),
@@ -94,15 +94,30 @@ mod tests {
     use super::*;
     use crate::{Splats, logit};
 
+    const OPTIONS: FastOptions = FastOptions {
+        target: 4,
+        floor: 0,
+        min_opacity: 0.01,
+        min_weight: 0.1,
+        min_frames: 2.0,
+        error_threshold: 1.0,
+        min_extent: 2.0,
+    };
+
+    /// Splats of this opacity along the first axis.
+    fn row(count: usize, spacing: f32, opacity: f32) -> Splats {
+        let mut splats = Splats::zeros(count, 0);
+        for i in 0..count {
+            splats.means.set(0, i, spacing * i as f32);
+            splats.quats.set(0, i, 1.0);
+            splats.opacity_logits.set(0, i, logit(opacity));
+        }
+        splats
+    }
+
     #[test]
     fn splats_with_errors_are_split_and_invisible_ones_removed() {
-        let mut splats = Splats::zeros(4, 0);
-        for i in 0..4 {
-            splats.means.set(0, i, 10.0 * i as f32);
-            splats.quats.set(0, i, 1.0);
-            splats.opacity_logits.set(0, i, logit(0.5));
-        }
-        let mut state = SplatState::new(splats);
+        let mut state = SplatState::new(row(4, 10.0, 0.5));
         for (i, (error, weight)) in [(5.0, 9.0), (0.1, 9.0), (3.0, 9.0), (0.0, 0.01)]
             .into_iter()
             .enumerate()
@@ -119,15 +134,7 @@ mod tests {
                 state.statistics.set(plane, at, value);
             }
         }
-        let options = FastOptions {
-            target: 4,
-            floor: 0,
-            min_opacity: 0.01,
-            min_weight: 0.1,
-            min_frames: 2.0,
-            error_threshold: 1.0,
-            min_extent: 2.0,
-        };
+        let options = OPTIONS;
         let change = densify(&mut state, &options);
         assert_eq!(
             (change.split, change.pruned, state.len()),
@@ -140,21 +147,10 @@ mod tests {
 
     #[test]
     fn splats_that_are_rarely_in_view_are_judged_by_several_rounds() {
-        let mut splats = Splats::zeros(2, 0);
-        for i in 0..2 {
-            splats.means.set(0, i, 10.0 * i as f32);
-            splats.quats.set(0, i, 1.0);
-            splats.opacity_logits.set(0, i, logit(0.5));
-        }
-        let mut state = SplatState::new(splats);
+        let mut state = SplatState::new(row(2, 10.0, 0.5));
         let options = FastOptions {
-            target: 4,
-            floor: 0,
-            min_opacity: 0.01,
-            min_weight: 0.1,
             min_frames: 5.0,
-            error_threshold: 1.0,
-            min_extent: 2.0,
+            ..OPTIONS
         };
         // In one frame of each round, and in four of the other's, which hide it.
         for split in [0, 1] {
@@ -176,12 +172,7 @@ mod tests {
 
     #[test]
     fn splats_that_all_fade_are_kept_down_to_the_floor() {
-        let mut splats = Splats::zeros(5, 0);
-        for i in 0..5 {
-            splats.means.set(0, i, i as f32);
-            splats.quats.set(0, i, 1.0);
-            splats.opacity_logits.set(0, i, logit(0.001));
-        }
+        let mut splats = row(5, 1.0, 0.001);
         splats.means.set(1, 4, f32::NAN);
         let mut state = SplatState::new(splats);
         for (i, weight) in [3.0, 1.0, 4.0, 2.0, 9.0].into_iter().enumerate() {
@@ -192,10 +183,7 @@ mod tests {
             target: 9,
             floor: 2,
             min_opacity: 0.005,
-            min_weight: 0.1,
-            min_frames: 2.0,
-            error_threshold: 1.0,
-            min_extent: 2.0,
+            ..OPTIONS
         };
         assert_eq!(densify(&mut state, &options).pruned, 3);
         let mut left: Vec<f32> = (0..2).map(|i| state.splats.means.get(0, i)).collect();

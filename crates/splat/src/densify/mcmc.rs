@@ -38,7 +38,7 @@ pub fn densify(state: &mut SplatState, options: &McmcOptions, rng: &mut Rng) -> 
     let sources = draw(&opacities, target - alive.len(), rng);
     let replicated = replicate(&mut state.splats, &sources);
     let copies = state.splats.gather(&sources);
-    state.rebuild(alive, &[&copies], &replicated, |_| false);
+    state.rebuild(alive, &[&copies], &replicated, |_, _| false);
     DensityChange {
         cloned: sources.len(),
         split: 0,

@@ -73,7 +73,7 @@ pub fn densify(state: &mut SplatState, options: &TamingOptions, rng: &mut Rng) -
     let mut gone = [&split[..], &pruned[..]].concat();
     gone.sort_unstable();
     let left = without((0..state.len() as u32).collect(), &gone);
-    state.rebuild(left, &[&clones, &halves], &[], |_| false);
+    state.rebuild(left, &[&clones, &halves], &[], |_, _| false);
     DensityChange {
         cloned: clone.len(),
         split: split.len(),

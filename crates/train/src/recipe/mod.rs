@@ -247,7 +247,7 @@ documented! {
         /// The splats over which they are averaged: `visible`, those visible in the frame, or `all`.
         #[serde(default)]
         pub of: RegularizedKind,
-        /// Unit of sizes: `extent`, the scene's, or `world`, the dataset's own.
+        /// Unit of sizes: `extent`, the scene's, but at most the depth of what most views show, or `world`, the dataset's own.
         #[serde(default)]
         pub unit: LengthUnit,
     }
@@ -408,12 +408,7 @@ impl Recipe {
             let mut paths = overrides.iter().filter_map(|given| given.split_once('='));
             paths.any(|(path, _)| path.trim().strip_prefix("params.") == Some(param.name()))
         };
-        for params in [
-            &mut recipe.known_space,
-            &mut recipe.cut_out,
-            &mut recipe.skies,
-            &mut recipe.large,
-        ] {
+        for params in recipe.conditional_mut() {
             params.retain(|param, _| !is_set(param));
         }
         recipe.complete_sockets();
@@ -487,17 +482,24 @@ impl Recipe {
             let default = Knob::Const(param.row().default);
             first.params.entry(param).or_insert(default);
         }
-        let conditional = [
+        let raise = |params: &mut Params| {
+            if let Some(knob) = params.get_mut(&param) {
+                knob.raise_to(f64::from(degree));
+            }
+        };
+        raise(&mut self.params);
+        self.conditional_mut().into_iter().for_each(raise);
+        self.stage.iter_mut().for_each(|stage| raise(&mut stage.params));
+    }
+
+    /// The tables of parameters that depend on the data.
+    fn conditional_mut(&mut self) -> [&mut Params; 4] {
+        [
             &mut self.known_space,
             &mut self.cut_out,
             &mut self.skies,
             &mut self.large,
-        ];
-        let stages = self.stage.iter_mut().map(|stage| &mut stage.params);
-        let tables = std::iter::once(&mut self.params).chain(conditional).chain(stages);
-        for knob in tables.filter_map(|params| params.get_mut(&param)) {
-            knob.raise_to(f64::from(degree));
-        }
+        ]
     }
 
     /// Recipe steps of all stages.

@@ -236,7 +236,7 @@ table! {
         curve: Some("loss.opacity squared"),
         source: "CurriculumGS",
     }
-    /// Weight of the mean standard deviation, in units of the scene's extent.
+    /// Weight of the mean standard deviation, in units of `regularizers.unit`.
     ScaleReg {
         name: "scale_reg",
         unit: "",
@@ -246,7 +246,7 @@ table! {
         curve: Some("loss.size"),
         source: "3DGS-MCMC (Kheradmand et al. 2024), eq. 10",
     }
-    /// Weight of the mean squared Frobenius norm of the covariance, in units of the scene's extent to the fourth.
+    /// Weight of the mean squared Frobenius norm of the covariance, in units of `regularizers.unit` to the fourth.
     CovarianceReg {
         name: "covariance_reg",
         unit: "",
@@ -436,7 +436,8 @@ table! {
         curve: Some("rate.sky"),
         source: "Irradia",
     }
-    /// Learning rate of the poses, in radians and in extents of the scene, if the recipe has `refine_poses`.
+    /// Learning rate of the poses, in radians and in extents of the scene (at most the depth of what most views show), if the recipe has
+    /// `refine_poses`.
     RatePoses {
         name: "rate_poses",
         unit: "radians, extents of the scene",

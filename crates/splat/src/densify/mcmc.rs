@@ -34,7 +34,11 @@ pub fn densify(state: &mut SplatState, options: &McmcOptions, rng: &mut Rng) -> 
         return DensityChange::default(); // No live splat to relocate to.
     }
     let dead = n - alive.len();
-    let target = ((n as f32 * options.growth) as usize).clamp(n, options.max_splats.max(n));
+    // At least one more: the authors' truncation keeps up to 19 splats at a growth of 1.05.
+    let least = n + usize::from(options.growth > 1.0);
+    let target = ((n as f32 * options.growth) as usize)
+        .max(least)
+        .min(options.max_splats.max(n));
     let sources = draw(&opacities, target - alive.len(), rng);
     let replicated = replicate(&mut state.splats, &sources);
     let copies = state.splats.gather(&sources);
@@ -194,6 +198,23 @@ mod tests {
         assert_eq!((s.len(), change.cloned, change.pruned), (5, 3, 2));
         let places: Vec<f32> = (0..5).map(|i| s.splats.means.get(0, i)).collect();
         assert!(places.iter().all(|x| *x == 0.0 || *x == 2.0), "{places:?}");
+    }
+
+    #[test]
+    fn few_splats_grow_one_by_one_up_to_the_cap_and_only_if_the_recipe_grows() {
+        let mut options = McmcOptions {
+            min_opacity: 0.005,
+            growth: 1.05,
+            max_splats: 4,
+        };
+        let mut s = state(&[0.9, 0.5]);
+        for count in [3, 4, 4] {
+            densify(&mut s, &options, &mut Rng::new(3, 3));
+            assert_eq!(s.len(), count);
+        }
+        (options.growth, options.max_splats) = (1.0, 9);
+        densify(&mut s, &options, &mut Rng::new(3, 3));
+        assert_eq!(s.len(), 4);
     }
 
     #[test]

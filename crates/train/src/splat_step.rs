@@ -183,14 +183,15 @@ impl Trainer {
         }
         let adam = &self.recipe.adam;
         let (noise, limit) = (plan.value(Param::Noise), plan.value(Param::ConditionCap));
+        let regularizer_unit = match self.recipe.regularizers.unit {
+            LengthUnit::Extent => self.length_unit,
+            LengthUnit::World => 1.0,
+        };
         Update {
             statistics: plan.gathers,
             regularizers: plan.regularizers(),
             regularized: self.recipe.regularizers.of.into(),
-            regularizer_unit: match self.recipe.regularizers.unit {
-                LengthUnit::Extent => self.length_unit,
-                LengthUnit::World => 1.0,
-            },
+            regularizer_unit,
             trained_fraction: plan.value(Param::TrainedShare),
             rates,
             sh_degree: plan.sh_degree,
@@ -204,7 +205,7 @@ impl Trainer {
                 dense: adam.kind == AdamKind::Dense,
             },
             noise: (noise > 0.0).then_some(Noise {
-                amount: noise * typical_rate,
+                amount: noise * typical_rate / regularizer_unit.powi(2),
                 seed: self.options.seed,
                 step: self.clock.step,
             }),
@@ -298,5 +299,43 @@ impl Trainer {
     /// Passes the state's filter to the renderer.
     pub(crate) fn restore_filter(&mut self) {
         self.engine.use_filter(self.recipe.render.smoothing_filter);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::checkpoint::tests::dataset;
+    use crate::{Recipe, TrainOptions};
+    use irradia_scene::Similarity;
+    use irradia_splat::{SplatState, Splats, logit};
+
+    /// The first noise on a faint splat in a world of `scale` units.
+    fn noise(recipe: &str, scale: f64) -> f32 {
+        let world = Similarity {
+            scale,
+            ..Similarity::IDENTITY
+        };
+        let recipe = Recipe::parse(recipe, Recipe::built_in(recipe).unwrap(), &[]).unwrap();
+        let data = Arc::new((*dataset()).clone().in_world(world));
+        let trainer = Trainer::new(data, recipe, TrainOptions::default()).unwrap();
+        let plan = schedule::plan(&trainer.recipe, &trainer.clock);
+        let update = trainer.update(&plan, 0, &trainer.dataset.views[0].camera);
+        let Noise { amount, seed, step } = update.noise.expect("a recipe with noise");
+        let mut splats = Splats::zeros(1, 0);
+        splats.quats.set(0, 0, 1.0);
+        (0..3).for_each(|c| splats.log_scales.set(c, 0, (0.1 * scale as f32).ln()));
+        splats.opacity_logits.set(0, 0, logit(0.003));
+        let mut state = SplatState::new(splats);
+        mcmc::add_noise(&mut state, amount, seed, step);
+        state.splats.means.get(0, 0)
+    }
+
+    #[test]
+    fn noise_follows_the_size_of_the_scene_except_as_published() {
+        let ratio = |recipe| noise(recipe, 10.0) / noise(recipe, 1.0);
+        let (tuned, published) = (ratio("mcmc-tuned"), ratio("mcmc"));
+        assert!((tuned / 10.0 - 1.0).abs() < 1e-3, "{tuned}");
+        assert!((published / 1000.0 - 1.0).abs() < 1e-3, "{published}");
     }
 }

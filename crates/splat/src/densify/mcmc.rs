@@ -100,7 +100,7 @@ const NOISE_OPACITY: f32 = 0.005;
 const NOISE_STEEPNESS: f32 = 100.0;
 
 /// Moves the means by noise shaped by each splat's covariance: `rate` covariance normal(), faded out for opaque splats (eq. 8).
-/// `rate` is the means' learning rate times the authors' 5e5, world units.
+/// `rate` is the means' learning rate times the authors' 5e5, the offset in world units at a covariance of 1.
 pub fn add_noise(state: &mut SplatState, rate: f32, seed: u64, step: u64) {
     let n = state.len();
     let splats = &state.splats;

@@ -247,7 +247,8 @@ documented! {
         /// The splats over which they are averaged: `visible`, those visible in the frame, or `all`.
         #[serde(default)]
         pub of: RegularizedKind,
-        /// Unit of sizes: `extent`, the scene's, but at most the depth of what most views show, or `world`, the dataset's own.
+        /// Unit of sizes, here and in `noise`: `extent`, the scene's, but at most the depth of what most views show, or `world`, the
+        /// dataset's own.
         #[serde(default)]
         pub unit: LengthUnit,
     }

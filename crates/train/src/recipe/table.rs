@@ -266,7 +266,8 @@ table! {
         curve: Some("cap.condition number"),
         source: "CurriculumGS",
     }
-    /// Noise on the means of faint splats, as a factor on the means' rate.
+    /// Noise on the means of faint splats, as a factor on the means' rate and the splat's covariance in squared units of
+    /// `regularizers.unit`.
     Noise {
         name: "noise",
         unit: "",

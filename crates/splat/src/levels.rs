@@ -5,6 +5,7 @@
 //! section 4.1), not times its volume as in [`densify::merge`](crate::densify::merge): two flat splats that are not quite in one plane
 //! would make a thick one of the same volume, and lose their opacity.
 
+use crate::densify::is_finite;
 use crate::nearest::Nearest;
 use crate::render::ALPHA_MIN;
 use crate::{Splats, eigen, logit};
@@ -42,13 +43,6 @@ pub fn merged(splats: &Splats, count: usize) -> Splats {
         left = unite(&left, &blobs, &pairs);
     }
     left
-}
-
-fn is_finite(splats: &Splats, i: usize) -> bool {
-    let columns = [&splats.means, &splats.quats, &splats.log_scales];
-    columns
-        .iter()
-        .all(|column| (0..column.count()).all(|c| column.get(c, i).is_finite()))
 }
 
 fn blob(splats: &Splats, i: usize) -> Blob {

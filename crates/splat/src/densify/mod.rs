@@ -7,6 +7,8 @@ pub mod merge;
 mod split;
 pub mod taming;
 
+pub(crate) use split::is_finite;
+
 /// The outcome of one round of density control.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct DensityChange {

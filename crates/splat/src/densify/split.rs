@@ -22,9 +22,12 @@ pub(super) fn largest_scale(splats: &Splats, i: usize) -> f32 {
         .exp()
 }
 
-/// Whether position and size are finite.
-pub(super) fn is_finite(splats: &Splats, i: usize) -> bool {
-    (0..3).all(|c| splats.means.get(c, i).is_finite() && splats.log_scales.get(c, i).is_finite())
+/// Whether position, rotation and size are finite.
+pub(crate) fn is_finite(splats: &Splats, i: usize) -> bool {
+    let columns = [&splats.means, &splats.quats, &splats.log_scales];
+    columns
+        .iter()
+        .all(|column| (0..column.count()).all(|c| column.get(c, i).is_finite()))
 }
 
 fn rotation(splats: &Splats, i: usize) -> Quat {

@@ -97,6 +97,11 @@ impl Intrinsics {
         if self.lens.is_wide() { point.length() } else { point.z }
     }
 
+    /// Whether the lens shows something at pixel coordinates `(x, y)`.
+    pub fn shows(&self, pixel: Vec2) -> bool {
+        self.lens.direction(self.plane_of(pixel.as_dvec2())).is_some()
+    }
+
     /// The point in camera space that is seen at pixel coordinates `(x, y)` and a [depth](Self::depth) of 1; straight ahead where the
     /// lens shows nothing.
     pub fn ray(&self, pixel: Vec2) -> Vec3 {

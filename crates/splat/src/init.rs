@@ -81,13 +81,13 @@ pub enum PixelClass {
 /// At most `count` points in the cameras' frusta, for scenes without points. `depth_bounds[i]` holds the nearest and farthest
 /// depth of view i's scene, where known; otherwise depths are drawn around that of the point on which the cameras focus.
 ///
-/// Points are drawn along rays of random pixels, uniformly in inverse depth, and kept with a probability that grows with the
-/// fraction of cameras that see them, so that they concentrate where views overlap. `open(view)` opens a photograph and
-/// returns the content of its pixels; photographs are opened one after the other, in one or a few passes over all of them. A
-/// point that is transparent in any camera is outside the visual hull (Laurentini 1994) and is discarded; so is one that is
-/// masked in more cameras than not, since training would never remove it. A point's colour is the mean over the cameras that
-/// see it: correct if it lies on a surface, and elsewhere never so dark that the clamp of negative colours prevents it from
-/// learning.
+/// Points are drawn along rays of random pixels at which the lens shows something, uniformly in inverse depth, and kept with a
+/// probability that grows with the fraction of cameras that see them, so that they concentrate where views overlap.
+/// `open(view)` opens a photograph and returns the content of its pixels; photographs are opened one after the other, in one or
+/// a few passes over all of them. A point that is transparent in any camera is outside the visual hull (Laurentini 1994) and is
+/// discarded; so is one that is masked in more cameras than not, since training would never remove it. A point's colour is the
+/// mean over the cameras that see it: correct if it lies on a surface, and elsewhere never so dark that the clamp of negative
+/// colours prevents it from learning.
 ///
 /// # Errors
 /// Those of `open`.
@@ -105,24 +105,27 @@ pub fn random_points<E, C: Fn(Vec2) -> PixelClass + Sync>(
         let camera = &cameras[view];
         let k = &camera.intrinsics;
         let pixel = Vec2::new(rng.uniform() * k.width as f32, rng.uniform() * k.height as f32);
+        if !k.shows(pixel) {
+            return None;
+        }
         let [near, far] = depth_bounds.get(view).copied().flatten().unwrap_or_else(|| {
             let distance = focus.distance(camera.pose.position).max(4.0 * camera.near);
             [0.5 * distance, 1.6 * distance]
         });
         let inverse = rng.range(1.0 / far, 1.0 / near);
         let point = camera.pose.position + camera.pose.rotation * k.ray(pixel) / inverse;
-        Candidate {
+        Some(Candidate {
             point,
             chance: rng.uniform(),
             ..Candidate::default()
-        }
+        })
     };
     let attempts = if cameras.is_empty() { 0 } else { 20 * count };
     let mut made = 0;
     while made < attempts && cloud.len() < count {
         // Usually one pass suffices.
         let batch = (4 * count).min(attempts - made);
-        let mut candidates: Vec<Candidate> = (0..batch).map(|_| draw()).collect();
+        let mut candidates: Vec<Candidate> = (0..batch).filter_map(|_| draw()).collect();
         for (view, camera) in cameras.iter().enumerate() {
             let content = open(view)?;
             candidates
@@ -219,7 +222,7 @@ pub fn camera_extent(cameras: &[Camera]) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use irradia_scene::{Intrinsics, Pose};
+    use irradia_scene::{Intrinsics, Lens, Pose};
 
     const OPTIONS: InitOptions = InitOptions {
         opacity: 0.1,
@@ -261,6 +264,25 @@ mod tests {
             assert_eq!(splats.len(), n);
             assert!(splats.log_scales.as_slice().iter().all(|s| s.is_finite()));
         }
+    }
+
+    #[test]
+    fn no_points_lie_where_a_lens_shows_nothing() {
+        // The image circle has a radius of pi times 10 pixels, and half of the image's area.
+        let fisheye = Intrinsics {
+            fx: 10.0,
+            fy: 10.0,
+            lens: Lens::fisheye([0.0; 4]),
+            ..Intrinsics::from_fov_x(80, 80, 1.0)
+        };
+        let camera = Camera::new(Pose::look_at(Vec3::NEG_Z, Vec3::ZERO, Vec3::NEG_Y), fisheye);
+        let open = |_| Ok::<_, ()>(|_| PixelClass::Color([0; 3]));
+        let cloud = random_points(&[camera], &[], 1000, &mut Rng::new(1, 0), open).unwrap();
+        let axial = cloud
+            .positions
+            .iter()
+            .filter(|p| p.truncate().length() < 1e-3 * p.length());
+        assert_eq!((cloud.len(), axial.count()), (1000, 0));
     }
 
     #[test]

@@ -46,7 +46,7 @@ pub use rows::Rows;
 pub use space::{Frustum, Measure, Outside, Ray, Space};
 pub use state::FieldState;
 pub use tensors::Tensors;
-pub use to_points::{FieldPoints, PointsOptions, to_points};
+pub use to_points::{PointsOptions, to_points};
 pub use train::{ResidualQuery, StepLoss, StepOptions, residual_at, train_residual, train_step, train_views};
 
 /// The scalar type of `S`.

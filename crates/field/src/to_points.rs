@@ -3,8 +3,10 @@
 use crate::field::Field;
 use crate::pass::{Pass, trace};
 use crate::render::view::camera_ray;
+use crate::space::Ray;
+use glam::{Vec2, Vec3};
 use irradia_compute::Level;
-use irradia_scene::{Camera, Rng};
+use irradia_scene::{Camera, PointCloud, Rng};
 use rayon::prelude::*;
 
 /// How surfaces are sampled.
@@ -29,25 +31,14 @@ impl Default for PointsOptions {
     }
 }
 
-/// Points on a field's surfaces. All columns have the same length.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct FieldPoints {
-    /// World positions.
-    pub positions: Vec<[f32; 3]>,
-    /// sRGB in \[0, 1\], the mean over the rays that hit the point's cell.
-    pub colors: Vec<[f32; 3]>,
-    /// Mean alpha of the rays that hit the point's cell, 0 to 1.
-    pub opacities: Vec<f32>,
-    /// Half the distance to the neighbours, world units: a standard deviation at which neighbouring Gaussians overlap.
-    pub sizes: Vec<f32>,
-}
-
 /// Hits per point requested: a surface's cells are then hit more than once on average.
 const HITS_PER_POINT: usize = 2;
 /// Maximum number of rounds, each with as many rays as hits are needed: much of each image may be empty.
 const MAX_ROUNDS: u64 = 16;
 /// Rays per task.
 const RAYS_PER_TASK: usize = 1024;
+/// Maximum number of pixels drawn for one ray: all may be masked.
+const MAX_DRAWS: usize = 100;
 /// The finest grid for thinning, cells per side of the unit cube.
 const MAX_SIDE: u32 = 4096;
 
@@ -56,15 +47,19 @@ const MAX_SIDE: u32 = 4096;
 struct Hit {
     unit: [f32; 3],
     color: [f32; 3],
-    alpha: f32,
 }
 
-/// Traces rays through random pixels of `cameras` and keeps one point per cell of the finest even grid that has at most
+/// Traces rays through random pixels of `cameras`, those for which `is_used(camera, pixel)` holds, and keeps one point per cell of the finest even grid that has at most
 /// `options.count` non-empty cells. The grid is in the field's own space, so that distant surfaces are thinned to the field's
 /// resolution there.
-pub fn to_points(field: &Field, cameras: &[Camera], options: &PointsOptions) -> FieldPoints {
+pub fn to_points(
+    field: &Field,
+    cameras: &[Camera],
+    options: &PointsOptions,
+    is_used: impl Fn(usize, Vec2) -> bool + Sync,
+) -> PointCloud {
     if cameras.is_empty() || options.count == 0 {
-        return FieldPoints::default();
+        return PointCloud::default();
     }
     let wanted = HITS_PER_POINT * options.count;
     let chunks = wanted.div_ceil(RAYS_PER_TASK) as u64;
@@ -73,7 +68,12 @@ pub fn to_points(field: &Field, cameras: &[Camera], options: &PointsOptions) -> 
         let traced: Vec<Vec<Hit>> = (round * chunks..(round + 1) * chunks)
             .into_par_iter()
             .map_init(Vec::new, |passes, chunk| {
-                trace_hits(field, cameras, options, chunk, passes)
+                let mut rng = Rng::new(options.seed, chunk);
+                let draws = (0..RAYS_PER_TASK).filter_map(|_| draw(cameras, &is_used, &mut rng));
+                let rays: Vec<Ray> = draws
+                    .map(|(camera, pixel)| camera_ray(field, camera, pixel.x, pixel.y).0)
+                    .collect();
+                trace_hits(field, &rays, options.alpha, passes)
             })
             .collect();
         hits.extend(traced.into_iter().flatten());
@@ -96,32 +96,28 @@ pub fn to_points(field: &Field, cameras: &[Camera], options: &PointsOptions) -> 
     thin(field, &hits, low)
 }
 
-fn trace_hits(
-    field: &Field,
-    cameras: &[Camera],
-    options: &PointsOptions,
-    chunk: u64,
-    passes: &mut Vec<Pass>,
-) -> Vec<Hit> {
-    let mut rng = Rng::new(options.seed, chunk);
-    let rays: Vec<_> = (0..RAYS_PER_TASK)
-        .map(|_| {
-            let camera = &cameras[rng.below(cameras.len() as u32) as usize];
-            let (w, h) = (camera.intrinsics.width as f32, camera.intrinsics.height as f32);
-            camera_ray(field, camera, rng.uniform() * w, rng.uniform() * h).0
-        })
-        .collect();
+/// A random pixel of `cameras` that is used and at which the lens shows something.
+fn draw<'a>(cameras: &'a [Camera], is_used: impl Fn(usize, Vec2) -> bool, rng: &mut Rng) -> Option<(&'a Camera, Vec2)> {
+    (0..MAX_DRAWS).find_map(|_| {
+        let view = rng.below(cameras.len() as u32) as usize;
+        let k = &cameras[view].intrinsics;
+        let pixel = Vec2::new(rng.uniform() * k.width as f32, rng.uniform() * k.height as f32);
+        (k.shows(pixel) && is_used(view, pixel)).then_some((&cameras[view], pixel))
+    })
+}
+
+/// Where the rays that reach an alpha of `min_alpha` hit a surface.
+fn trace_hits(field: &Field, rays: &[Ray], min_alpha: f32, passes: &mut Vec<Pass>) -> Vec<Hit> {
     let (mut hits, mut at) = (Vec::new(), 0);
     while at < rays.len() {
         let taken = trace(Level::detect(), field, &rays[at..], &[], None, passes);
         let pass = &passes[passes.len() - 1];
         for r in 0..taken {
             let (color, alpha) = pass.composite(r);
-            if let (Some(i), true) = (pass.median(r), alpha >= options.alpha) {
+            if let (Some(i), true) = (pass.median(r), alpha >= min_alpha) {
                 hits.push(Hit {
                     unit: field.space.unit(rays[at + r].at(pass.middles[i])),
                     color: color.map(|c| c / alpha),
-                    alpha,
                 });
             }
         }
@@ -137,35 +133,24 @@ fn cell(unit: [f32; 3], side: u32) -> u64 {
 }
 
 /// One point per cell: the mean of its hits.
-fn thin(field: &Field, hits: &[Hit], side: u32) -> FieldPoints {
+fn thin(field: &Field, hits: &[Hit], side: u32) -> PointCloud {
     let mut order: Vec<(u64, u32)> = (0u32..).zip(hits).map(|(i, hit)| (cell(hit.unit, side), i)).collect();
     order.par_sort_unstable();
-    let half = 0.5 / side as f32;
-    let mut points = FieldPoints::default();
+    let mut points = PointCloud::default();
     for members in order.chunk_by(|a, b| a.0 == b.0) {
         let mut sum = Hit {
             unit: [0.0; 3],
             color: [0.0; 3],
-            alpha: 0.0,
         };
         for (_, i) in members {
             let hit = &hits[*i as usize];
             (0..3).for_each(|c| sum.unit[c] += hit.unit[c]);
             (0..3).for_each(|c| sum.color[c] += hit.color[c]);
-            sum.alpha += hit.alpha;
         }
         let mean = 1.0 / members.len() as f32;
-        let unit = sum.unit.map(|v| v * mean);
-        let world = |unit: [f32; 3]| glam::Vec3::from(field.space.to_world(field.space.from_unit(unit)));
-        let widths = (0..3).map(|c| {
-            let [mut low, mut high] = [unit; 2];
-            (low[c], high[c]) = ((unit[c] - half).max(0.0), (unit[c] + half).min(1.0));
-            world(low).distance(world(high))
-        });
-        points.sizes.push(widths.sum::<f32>() / 6.0);
-        points.positions.push(world(unit).to_array());
-        points.colors.push(sum.color.map(|v| v * mean));
-        points.opacities.push(sum.alpha * mean);
+        let world = field.space.to_world(field.space.from_unit(sum.unit.map(|v| v * mean)));
+        points.positions.push(Vec3::from(world));
+        points.colors.push(sum.color.map(|v| (v * mean * 255.0).round() as u8));
     }
     points
 }

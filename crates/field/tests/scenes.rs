@@ -9,7 +9,7 @@ use irradia_field::sample::march::{March, Steps};
 use irradia_field::{
     Field, FieldConfig, Occupancy, PointsOptions, RenderOptions, Sampler, Space, density_at, render_view, to_points,
 };
-use irradia_scene::{Camera, Intrinsics, Pose};
+use irradia_scene::{Camera, Intrinsics, Lens, Pose};
 
 /// A camera at z = -3, looking along +Z at the cube -1..1.
 fn camera() -> Camera {
@@ -123,19 +123,36 @@ fn an_opaque_wall_renders_its_depth_and_colour() {
         count: 500,
         ..PointsOptions::default()
     };
-    let points = to_points(&field, &[camera()], &options);
-    let n = points.positions.len();
-    assert!((100..=500).contains(&n), "{n} points");
-    assert_eq!(
-        [points.colors.len(), points.opacities.len(), points.sizes.len()],
-        [n; 3]
-    );
-    for i in 0..n {
-        assert!(points.positions[i][2].abs() < 0.006 && points.opacities[i] > 0.999);
-        assert!((points.colors[i][0] - 0.5).abs() < 1e-3);
-        // The camera sees 1.53 x 1.15 units of the wall; 500 cells of it are at least 0.06 wide.
-        assert!((0.02..0.1).contains(&points.sizes[i]), "{}", points.sizes[i]);
-    }
+    let points = to_points(&field, &[camera()], &options, |_, _| true);
+    assert!((100..=500).contains(&points.len()), "{} points", points.len());
+    assert_eq!(points.colors, vec![[128; 3]; points.len()]);
+    assert!(points.positions.iter().all(|p| p.z.abs() < 0.006));
+
+    // A mask that keeps the three leftmost columns: beyond 5 pixels, or 0.479 units of the wall, from the middle.
+    let masked = to_points(&field, &[camera()], &options, |_, pixel| pixel.x < 3.0);
+    assert!(masked.len() > 100, "{} points", masked.len());
+    assert!(masked.positions.iter().all(|p| p.x < -0.478));
+    assert!(to_points(&field, &[camera()], &options, |_, _| false).is_empty());
+}
+
+#[test]
+fn no_points_lie_where_a_lens_shows_nothing() {
+    let field = uniform(8.0, |[_, _, z]| z >= 16);
+    // The image circle, whose radius is pi times 2 pixels, leaves the corners of the image dark.
+    let fisheye = Intrinsics {
+        fx: 2.0,
+        fy: 2.0,
+        lens: Lens::fisheye([0.0; 4]),
+        ..Intrinsics::from_fov_x(16, 16, 1.0)
+    };
+    let camera = Camera::new(camera().pose, fisheye);
+    let options = PointsOptions {
+        count: 500,
+        ..PointsOptions::default()
+    };
+    let points = to_points(&field, &[camera], &options, |_, _| true);
+    let axial = points.positions.iter().filter(|p| p.truncate().length() < 1e-4);
+    assert!(points.len() > 100 && axial.count() == 0, "{} points", points.len());
 }
 
 #[test]
@@ -150,7 +167,7 @@ fn an_empty_ray_is_transparent() {
     assert_eq!((view.alpha[middle], view.depth[middle]), (0.0, 0.0));
     assert_eq!([0, 1, 2].map(|c| view.color[c * pixels + middle]), [0.2, 0.4, 0.6]);
     assert_eq!([0, 1, 2].map(|c| view.normals[c * pixels + middle]), [0.0; 3]);
-    assert!(to_points(&field, &[], &PointsOptions::default()).positions.is_empty());
+    assert!(to_points(&field, &[], &PointsOptions::default(), |_, _| true).is_empty());
 }
 
 #[test]

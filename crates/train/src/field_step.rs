@@ -9,7 +9,7 @@ use crate::trainer::{TrainError, Trainer};
 use crate::{event::StepReport, recipe::Represents};
 use cpu_time::ProcessTime;
 use irradia_field::{Background, Field, FieldState, KnownDepth, PointsOptions, StepOptions, TrainView, to_points};
-use irradia_scene::{Camera, Dataset, PointCloud};
+use irradia_scene::{Camera, Dataset, LoadError};
 use irradia_splat::{SplatState, init};
 use std::sync::Arc;
 use std::time::Instant;
@@ -160,19 +160,22 @@ impl Trainer {
         let (Some(field), Some(settings)) = (self.field.take(), &self.recipe.field) else {
             return Ok(());
         };
-        let (started, cpu_started) = (Instant::now(), ProcessTime::now());
-        let cameras = self.train_cameras();
         let options = PointsOptions {
             count: settings.points.min(self.cap),
             seed: Stream::FieldPoints.derived_seed(self.options.seed),
             ..PointsOptions::default()
         };
-        let found = to_points(&field.state().field, &cameras, &options);
-        let byte = |v: f32| (v.clamp(0.0, 1.0) * 255.0).round() as u8;
-        let cloud = PointCloud {
-            positions: found.positions.iter().map(|p| glam::Vec3::from_array(*p)).collect(),
-            colors: found.colors.iter().map(|c| c.map(byte)).collect(),
-        };
+        let scale = plan(&self.recipe, &self.clock).image_scale;
+        let views = self.dataset.train.clone();
+        let masks: Vec<Option<Vec<u8>>> = (0..views.len())
+            .map(|i| Ok(self.photos.get(&views[i..], scale)?.mask.clone()))
+            .collect::<Result<_, LoadError>>()?;
+        let (started, cpu_started) = (Instant::now(), ProcessTime::now());
+        let cameras: Vec<Camera> = views.iter().map(|view| self.scaled_camera(*view, scale)).collect();
+        let cloud = to_points(&field.state().field, &cameras, &options, |view, pixel| {
+            let at = pixel.y as usize * cameras[view].intrinsics.width as usize + pixel.x as usize;
+            masks[view].as_ref().is_none_or(|mask| mask[at] > 0)
+        });
         if cloud.is_empty() {
             return Err(TrainError::NoSurface);
         }
@@ -188,7 +191,7 @@ mod tests {
     use super::*;
     use crate::trainer::TrainOptions;
     use glam::Vec3;
-    use irradia_scene::{Intrinsics, Photo, Pose, Rng, View};
+    use irradia_scene::{Intrinsics, Photo, PointCloud, Pose, Rng, View};
     use irradia_splat::Renderer;
 
     const SIDE: u32 = 32;

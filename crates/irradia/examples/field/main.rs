@@ -184,15 +184,8 @@ fn train(args: &[String]) -> Result<()> {
         wall.elapsed().as_secs_f64()
     );
     let began = ProcessTime::now();
-    let points = to_points(&state.field, &cameras, &PointsOptions::default());
-    let mut sizes = points.sizes.clone();
-    sizes.sort_by(f32::total_cmp);
-    println!(
-        "{} points, median size {:.5}: {:.2} s CPU",
-        sizes.len(),
-        sizes.get(sizes.len() / 2).unwrap_or(&0.0),
-        began.elapsed().as_secs_f64()
-    );
+    let points = to_points(&state.field, &cameras, &PointsOptions::default(), |_, _| true);
+    println!("{} points: {:.2} s CPU", points.len(), began.elapsed().as_secs_f64());
     if !out.is_empty() {
         write_pictures(&PathBuf::from(out), &state.field, &held, background)?;
     }

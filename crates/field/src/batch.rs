@@ -70,6 +70,10 @@ pub struct Draw {
     pub background: Background,
 }
 
+/// Pixels without a ray that are drawn in a row before a batch remains smaller: all photographs may be masked. If a hundredth of the pixels
+/// is usable, a batch of 16,384 rays remains smaller once in 10^39.
+const MAX_MISSES: usize = 10_000;
+
 impl RayBatch {
     /// Removes all rays.
     pub fn clear(&mut self) {
@@ -87,11 +91,9 @@ impl RayBatch {
         if views.is_empty() {
             return;
         }
-        // Bounds the attempts, for photographs that are entirely masked.
-        for _ in 0..8 * what.rays {
-            if self.rays.len() == what.rays {
-                return;
-            }
+        let mut misses = 0;
+        while self.rays.len() < what.rays && misses < MAX_MISSES {
+            misses += 1;
             let view = &views[rng.below(views.len() as u32) as usize];
             let [width, height] = [view.camera.intrinsics.width, view.camera.intrinsics.height];
             let (pixel, depth) = if self.rays.len() < what.known && !view.depths.is_empty() {
@@ -128,6 +130,45 @@ impl RayBatch {
             self.backgrounds.push(background);
             self.opaque.push(view.alpha.is_none());
             self.images.push(view.image);
+            misses = 0;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use irradia_scene::{Intrinsics, Pose};
+
+    #[test]
+    fn a_batch_is_full_if_a_mask_keeps_few_pixels_and_empty_if_it_keeps_none() {
+        let camera = Camera::new(
+            Pose::look_at(glam::Vec3::NEG_Z, glam::Vec3::ZERO, glam::Vec3::NEG_Y),
+            Intrinsics::from_fov_x(50, 50, 0.8),
+        );
+        // 2 % of the pixels are white, the others black.
+        let rgb: Vec<u8> = (0..3 * 2500).map(|i| if i < 3 * 50 { 255 } else { 0 }).collect();
+        let what = Draw {
+            rays: 1000,
+            known: 0,
+            background: Background::Fixed([0.0; 3]),
+        };
+        let drawn = |kept: usize| {
+            let mask: Vec<u8> = (0..2500).map(|i| u8::from(i < kept)).collect();
+            let view = TrainView {
+                camera: &camera,
+                rgb: &rgb,
+                alpha: None,
+                over: [0.0; 3],
+                mask: Some(&mask),
+                depths: &[],
+                image: 0,
+            };
+            let mut batch = RayBatch::default();
+            batch.draw(&[view], &what, &Space::cube([0.0; 3], 1.0), &mut Rng::new(1, 0));
+            batch.targets
+        };
+        assert_eq!(drawn(50), [[1.0; 3]; 1000]);
+        assert!(drawn(0).is_empty());
     }
 }

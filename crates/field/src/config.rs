@@ -227,6 +227,13 @@ impl FieldConfig {
                     "must be a multiple of 8",
                 );
             }
+            if let Some(skip) = net.skip.filter(|skip| !(1..net.depth).contains(skip)) {
+                return wrong(
+                    "layer with a skip connection",
+                    skip.to_string(),
+                    "must be a hidden layer after the first",
+                );
+            }
             if let Some(color) = net.color {
                 if color.width == 0 || !color.width.is_multiple_of(8) {
                     return wrong(
@@ -263,6 +270,12 @@ impl FieldConfig {
                         "must be more than 1e-5, with a cone of 0 to 1",
                     );
                 }
+                if !(0.0..).contains(&o.thickness) {
+                    return wrong("thickness", o.thickness.to_string(), "must be 0 or more");
+                }
+                if !(o.decay > 0.0 && o.decay <= 1.0) {
+                    return wrong("decay", o.decay.to_string(), "must be more than 0 and at most 1");
+                }
             }
             Sampler::Hierarchy { coarse, fine } => {
                 if !(2..=MAX_SAMPLES).contains(coarse) || !(1..=MAX_SAMPLES).contains(fine) {
@@ -283,5 +296,41 @@ impl FieldConfig {
             Sampler::Given { .. } => {}
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The message for [`FieldConfig::nerf`] with `skip`.
+    fn with_skip(skip: usize) -> Option<String> {
+        let mut config = FieldConfig::nerf(64, 64, 128);
+        config.net.skip = Some(skip);
+        config.check().err().map(|error| error.to_string())
+    }
+
+    /// The message for [`FieldConfig::hash_grid`] with the grid's `thickness` and `decay`.
+    fn with_grid(thickness: f32, decay: f32) -> Option<String> {
+        let mut config = FieldConfig::hash_grid();
+        if let Sampler::Occupancy(grid) = &mut config.sampler {
+            (grid.thickness, grid.decay) = (thickness, decay);
+        }
+        config.check().err().map(|error| error.to_string())
+    }
+
+    #[test]
+    fn values_without_meaning_are_refused_by_name() {
+        assert_eq!([with_skip(1), with_skip(7)], [None, None]);
+        for skip in [0, 8] {
+            assert!(with_skip(skip).is_some_and(|line| line.contains("skip")), "{skip}");
+        }
+        assert_eq!([with_grid(0.0, 1.0), with_grid(0.01, 0.8)], [None, None]);
+        for thickness in [-0.01, f32::NAN] {
+            assert!(with_grid(thickness, 0.8).is_some_and(|line| line.contains("thickness")));
+        }
+        for decay in [0.0, -0.5, 1.5, f32::NAN] {
+            assert!(with_grid(0.01, decay).is_some_and(|line| line.contains("decay")));
+        }
     }
 }

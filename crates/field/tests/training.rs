@@ -118,6 +118,36 @@ fn options() -> StepOptions {
     }
 }
 
+#[test]
+fn rays_beyond_the_most_samples_are_left_out() {
+    let cameras = cameras(4);
+    let balls: Vec<Ball> = cameras.iter().map(ball).collect();
+    let space = Space::cube([0.0; 3], 1.2);
+    let (_, config) = configs().remove(0);
+    let mut batch = RayBatch::default();
+    let what = Draw {
+        rays: 4000,
+        known: 0,
+        background: Background::Random,
+    };
+    batch.draw(&views(&cameras, &balls, false), &what, &space, &mut Rng::new(1, 0));
+    let step = |samples: usize| {
+        let mut state = FieldState::new(Field::new(config.clone(), space, 1).unwrap());
+        train_step(&mut state, &batch, &StepOptions { samples, ..options() })
+    };
+    let whole = step(usize::MAX);
+    assert_eq!(whole.rays, 4000);
+    let most = 64 * 1024;
+    assert!(whole.samples > 2 * most, "{whole:?}");
+    assert_eq!(step(whole.samples), whole, "all fit");
+    let cut = step(most / 4);
+    // Each of the 32 groups ends with a whole chunk, of 512 samples and those of its last rays.
+    assert!((most / 2..most + 32 * 1024).contains(&cut.samples), "{cut:?}");
+    let share = |loss: StepLoss| loss.samples as f64 / loss.rays as f64;
+    assert!((share(cut) / share(whole) - 1.0).abs() < 0.1, "{cut:?} {whole:?}");
+    assert!((cut.color / whole.color - 1.0).abs() < 0.1, "{cut:?} {whole:?}");
+}
+
 fn run(state: &mut FieldState, views: &[TrainView], options: &StepOptions, steps: usize) -> StepLoss {
     (0..steps).fold(StepLoss::default(), |_, _| train_views(state, views, options))
 }

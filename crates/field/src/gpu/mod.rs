@@ -2,8 +2,8 @@
 //!
 //! A thread marches a ray, with densities evaluated in registers, until the ray is opaque. The samples of all rays are then stored
 //! contiguously, plane by plane, and go through encoding, networks and compositing, forwards and backwards. Only the number of samples
-//! is read back in between: it determines the sizes of arrays here and the number of rays of the next batch on the host, so that no
-//! sample is dropped. The occupancy grid is kept on the host, which requests densities and uploads bits.
+//! is read back in between: it determines the sizes of arrays here and the number of rays of the next batch on the host. The last rays of
+//! a batch that has too many samples are left out. The occupancy grid is kept on the host, which requests densities and uploads bits.
 
 mod layout;
 mod training;
@@ -211,6 +211,22 @@ impl GpuField {
         let mut total = [0u32];
         self.starts.read(&gpu, rays, &mut total);
         total[0] as usize
+    }
+
+    /// Like [`Self::march`], but removes the last rays of `batch` if all together have more than `max_samples`, or more than the device's
+    /// arrays hold.
+    pub fn march_within(&mut self, batch: &mut Batch, max_samples: usize) -> usize {
+        batch.rays.truncate(self.max_rays(batch).max(1));
+        let samples = self.march(batch);
+        let limit = max_samples.min(self.max_batch_samples());
+        if samples <= limit {
+            return samples;
+        }
+        let mut starts = vec![0u32; batch.rays.len() + 1];
+        self.starts.read(&self.gpu, 0, &mut starts);
+        let kept = starts.partition_point(|start| *start as usize <= limit).max(2) - 1;
+        batch.rays.truncate(kept);
+        starts[kept] as usize
     }
 
     /// Maximum number of steps along any ray of `batch`.

@@ -206,6 +206,30 @@ fn a_step_has_the_gradients_and_losses_of_the_cpu() {
 }
 
 #[test]
+fn rays_beyond_the_most_samples_are_left_out() {
+    let Some(gpu) = gpu() else { return };
+    let photographs = Photographs::new();
+    let (_, config, space) = variants().into_iter().next().expect("a variant");
+    let mut state = state(config, space);
+    let mut batch = RayBatch::default();
+    let what = Draw {
+        rays: 200,
+        known: 0,
+        background: Background::Random,
+    };
+    batch.draw(&photographs.views(), &what, &space, &mut Rng::new(1, 1));
+    let options = StepOptions {
+        samples: 50,
+        ..StepOptions::default()
+    };
+    let mut training = GpuFieldTraining::new(gpu.clone(), &state).unwrap();
+    let loss = training.step(&mut state, &batch, &options);
+    gpu.check().unwrap();
+    assert!((150..=200).contains(&loss.samples), "{loss:?}");
+    assert!((1..200).contains(&loss.rays) && loss.color.is_finite(), "{loss:?}");
+}
+
+#[test]
 fn two_trainings_on_the_device_have_the_same_bytes() {
     let Some(gpu) = gpu() else { return };
     let photographs = Photographs::new();

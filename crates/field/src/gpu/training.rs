@@ -5,7 +5,7 @@ use super::{Batch, GpuField, RAY_GROUP, SAMPLE_GROUP};
 use crate::batch::RayBatch;
 use crate::field::Field;
 use crate::state::FieldState;
-use crate::train::{StepLoss, StepOptions, adam_step, depth_weight, offsets};
+use crate::train::{StepLoss, StepOptions, adam_step, depth_weight, max_samples, offsets};
 use irradia_compute::DeviceError;
 use irradia_compute::adam::AdamStep;
 use irradia_compute::gpu::{Array, Gpu, Work};
@@ -104,9 +104,9 @@ impl GpuFieldTraining {
     pub fn step(&mut self, state: &mut FieldState, batch: &RayBatch, options: &StepOptions) -> StepLoss {
         state.step += 1;
         let (gpu, field) = (self.field.gpu.clone(), &mut self.field);
+        let mut batch = packed(batch, options, state.step);
+        let samples = field.march_within(&mut batch, max_samples(options));
         let rays = batch.rays.len();
-        let batch = packed(batch, options, state.step);
-        let samples = field.march(&batch);
         field.prepare(&batch, samples);
         self.v_rows.reserve(&gpu, field.layout.rows * field.stride);
         self.losses.reserve(&gpu, 5 * rays);

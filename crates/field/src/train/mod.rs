@@ -80,7 +80,7 @@ pub struct StepLoss {
     pub color: f64,
     /// Weighted sum of all losses.
     pub total: f64,
-    /// Rays in the batch.
+    /// Rays in the batch, without those left out since they had too many samples together.
     pub rays: usize,
     /// Samples whose colour was computed, over all networks; determines the size of the next batch.
     pub samples: usize,
@@ -98,6 +98,9 @@ pub(crate) struct Scratch {
 
 /// One in this many empty cells is updated.
 pub(crate) const EMPTY_CELL_DIVISOR: u32 = 16;
+/// Samples of a batch, in units of those wanted, above which its last rays are left out, so that memory is bounded. The number of rays
+/// follows the number of samples only gradually, and a new part of the scene may yield many more.
+const MAX_EXCESS: usize = 4;
 /// Bounds of the number of rays in a batch.
 const RAY_BOUNDS: [usize; 2] = [64, 16_384];
 /// One in this many rays passes through a pixel of known depth if the depth loss is on.
@@ -135,6 +138,11 @@ pub(crate) fn draw(state: &mut FieldState, views: &[TrainView], options: &StepOp
 
 pub(crate) fn updates_occupancy(loss: &StepLoss, options: &StepOptions) -> bool {
     options.update_occupancy && loss.rays > 0
+}
+
+/// Number of samples that a batch may have.
+pub(crate) fn max_samples(options: &StepOptions) -> usize {
+    options.samples.saturating_mul(MAX_EXCESS)
 }
 
 /// Sets the number of rays of the next batch.
@@ -224,12 +232,11 @@ fn gradients(
         worker.rays(&task, range, &mut rng);
     });
     let loss = add_up(workers);
-    let mean = 1.0 / n.max(1) as f64;
+    let mean = 1.0 / loss.rays.max(1) as f64;
     StepLoss {
         color: loss.color * mean,
         total: loss.total * mean,
-        rays: n,
-        samples: loss.samples,
+        ..loss
     }
 }
 
@@ -258,6 +265,7 @@ impl StepLoss {
     fn add(&mut self, other: &Self) {
         self.color += other.color;
         self.total += other.total;
+        self.rays += other.rays;
         self.samples += other.samples;
     }
 }

@@ -1,6 +1,6 @@
 //! Forward pass, losses and backward pass of one group of a batch's rays.
 
-use super::{StepLoss, StepOptions};
+use super::{GROUPS, StepLoss, StepOptions, max_samples};
 use crate::background::background_vjp;
 use crate::batch::RayBatch;
 use crate::config::Sampler;
@@ -96,11 +96,11 @@ impl Worker {
         }
     }
 
-    /// Forward and backward over the rays `range` of the batch.
+    /// Forward and backward over the rays `range` of the batch, until the group has its share of the samples that a batch may have.
     pub fn rays(&mut self, task: &Task, mut range: std::ops::Range<usize>, rng: &mut Rng) {
         let field = task.field;
         self.clear(field);
-        while !range.is_empty() {
+        while !range.is_empty() && self.loss.samples <= max_samples(task.options) / GROUPS {
             let rays = &task.batch.rays[range.clone()];
             let images = &task.batch.images[range.clone()];
             let taken = trace(task.level, field, rays, images, Some(rng), &mut self.passes);
@@ -108,6 +108,7 @@ impl Worker {
                 self.backward(task, net, range.start..range.start + taken);
             }
             range.start += taken;
+            self.loss.rays += taken;
         }
     }
 

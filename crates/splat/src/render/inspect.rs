@@ -38,8 +38,8 @@ pub struct Hit {
 /// Squared distance of an ellipse's border, and of its rim's inner edge.
 const BORDER_SQUARED: f32 = 1.5 * 1.5;
 const RIM_SQUARED: f32 = 1.3 * 1.3;
-/// Squared radius of a point, pixels.
-const POINT_SQUARED: f32 = 1.5 * 1.5;
+/// Radius of a point, pixels.
+const POINT_RADIUS: f32 = 1.5;
 
 /// log2 of alpha at the pixel centre `(x, y)`, before the cap.
 fn log2_alpha(s: &Footprint2d, x: f32, y: f32) -> f32 {
@@ -66,21 +66,17 @@ impl Renderer {
     /// # Panics
     /// When nothing was rendered.
     pub fn shapes(&self, shape: Shape, background: [f32; 3]) -> Vec<f32> {
+        if shape == Shape::Points {
+            return self.points(background);
+        }
+        let is_ring = shape == Shape::Rings;
         // Colour so far, and the transmittance.
         let planes = self.by_pixel([0.0, 0.0, 0.0, 1.0], |[r, g, b, t], s, x, y| {
-            let (alpha, shade) = match shape {
-                Shape::Points => {
-                    let (dx, dy) = (x - s.xy[0], y - s.xy[1]);
-                    (f32::from(u8::from(dx * dx + dy * dy <= POINT_SQUARED)), 1.0)
-                }
-                Shape::Ellipses | Shape::Rings => {
-                    let m = 2.0 * LN_2 * (s.log2_opacity - log2_alpha(s, x, y));
-                    match (m <= BORDER_SQUARED, m >= RIM_SQUARED, shape) {
-                        (false, ..) | (_, false, Shape::Rings) => return true,
-                        (_, true, Shape::Rings) => (0.6, 1.0),
-                        (_, rim, _) => (1.0, if rim { 0.7 } else { 1.0 }),
-                    }
-                }
+            let m = 2.0 * LN_2 * (s.log2_opacity - log2_alpha(s, x, y));
+            let (alpha, shade) = match (m <= BORDER_SQUARED, m >= RIM_SQUARED, is_ring) {
+                (false, ..) | (_, false, true) => return true,
+                (_, true, true) => (0.6, 1.0),
+                (_, rim, false) => (1.0, if rim { 0.7 } else { 1.0 }),
             };
             for (to, from) in [r, g, b].into_iter().zip(s.color) {
                 *to += *t * alpha * shade * from;
@@ -93,6 +89,35 @@ impl Renderer {
             plane.iter().zip(&t).map(|(color, t)| color + t * background).collect()
         };
         [over(r, background[0]), over(g, background[1]), over(b, background[2])].concat()
+    }
+
+    /// The nearest splat's point in each pixel. Bins list faint splats in fewer pixels than their points cover, so these are found without
+    /// them.
+    fn points(&self, background: [f32; 3]) -> Vec<f32> {
+        let view = self.view.as_ref().expect("projection comes first");
+        let (width, height) = (view.width as usize, view.height as usize);
+        let mut nearest = vec![(u32::MAX, background); width * height];
+        // The pixels whose centres may lie within a point about `center`.
+        let covered = |center: f32, size: usize| {
+            let [first, last] = [-POINT_RADIUS, POINT_RADIUS].map(|radius| center + radius - 0.5);
+            first.ceil() as usize..size.min((last + 1.0).floor() as usize)
+        };
+        for (s, key) in self.footprints.iter().zip(&self.depth_keys) {
+            if *key == u32::MAX {
+                continue;
+            }
+            for y in covered(s.xy[1], height) {
+                for x in covered(s.xy[0], width) {
+                    let (dx, dy) = (x as f32 + 0.5 - s.xy[0], y as f32 + 0.5 - s.xy[1]);
+                    let pixel = &mut nearest[y * width + x];
+                    if *key < pixel.0 && dx * dx + dy * dy <= POINT_RADIUS * POINT_RADIUS {
+                        *pixel = (*key, s.color);
+                    }
+                }
+            }
+        }
+        let plane = |c: usize| nearest.iter().map(move |(_, color)| color[c]);
+        (0..3).flat_map(plane).collect()
     }
 
     /// The splats that contribute to the pixel in column `x`, row `y` of the last frame, front to back.
@@ -250,5 +275,34 @@ mod tests {
         let rings = renderer.shapes(Shape::Rings, [0.0; 3]);
         assert_eq!(at(&rings, 0, 20), 0.0, "rings are hollow");
         assert!(rings[..41 * 41].iter().any(|red| *red > 0.5));
+    }
+
+    #[test]
+    fn points_of_faint_splats_are_whole_across_borders_of_tiles() {
+        // Barely visible and smaller than a pixel, near a corner of four tiles.
+        let mut splats = Splats::zeros(1, 0);
+        splats.means.set(2, 0, 2.0);
+        splats.quats.set(0, 0, 1.0);
+        (0..3).for_each(|c| splats.log_scales.set(c, 0, -9.0));
+        (0..3).for_each(|c| splats.sh.set(c, 0, sh::dc_from_color(1.0)));
+        splats.opacity_logits.set(0, 0, logit(0.005));
+        let pose = Pose {
+            rotation: glam::Quat::IDENTITY,
+            position: glam::Vec3::ZERO,
+        };
+        let intrinsics = Intrinsics {
+            cx: 31.9,
+            cy: 32.2,
+            ..Intrinsics::from_fov_x(64, 64, 1.0)
+        };
+        let mut renderer = Renderer::new();
+        let view = ViewParams::new(&Camera::new(pose, intrinsics));
+        renderer.render(&splats, &view, &RenderOptions::default());
+        let points = renderer.shapes(Shape::Points, [0.0; 3]);
+        for (i, red) in points[..64 * 64].iter().enumerate() {
+            let center = glam::Vec2::new((i % 64) as f32 + 0.5, (i / 64) as f32 + 0.5);
+            let is_within = center.distance(glam::Vec2::new(31.9, 32.2)) <= 1.5;
+            assert_eq!(*red > 0.5, is_within, "{center}");
+        }
     }
 }

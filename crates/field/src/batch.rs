@@ -54,7 +54,7 @@ pub struct TrainView<'a> {
 pub struct KnownDepth {
     /// `y * width + x`.
     pub pixel: u32,
-    /// Depth along the camera's +Z, world units. Ignored unless positive and finite.
+    /// [Depth](irradia_scene::Intrinsics::depth), world units. Ignored unless positive and finite.
     pub depth: f32,
 }
 

@@ -15,8 +15,9 @@ use std::fs;
 const STATE_BYTES: usize = 4 * (4 * 59 + 5 + 1 + 1 + 4);
 /// Footprint, depth key and orders of a frame.
 const FOOTPRINT_BYTES: usize = 96;
-/// An intersection of a splat and a tile: index, blocks, position and the sums of its gradients.
-const INTERSECTION_BYTES: usize = 64;
+/// An intersection of a splat and a tile: the hit with its tile, the hit in the list by tile, the tile's entry, its position, and the sums
+/// of its gradients.
+const INTERSECTION_BYTES: usize = 24 + 16 + 16 + 4 + 48;
 /// Intersections per splat: most splats are out of view or within one or two tiles.
 const INTERSECTIONS_PER_SPLAT: usize = 3;
 /// A copy of parameters, moments and statistics, from which a checkpoint is written in the background.

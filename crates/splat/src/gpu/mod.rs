@@ -2,7 +2,7 @@
 //!
 //! Visible splats are sorted by depth, then their tiles by number, stably. Each splat's gradients are summed in a fixed order in each
 //! tile, then over its tiles in their order, so that results have the same bytes from run to run on the same device. They differ from
-//! the CPU's by rounding only.
+//! the CPU's by rounding, and MCMC's noise by its random numbers.
 
 mod frame;
 mod moves;

@@ -29,7 +29,7 @@ pub struct Hit {
     pub alpha: f32,
     /// Its share of the pixel's colour.
     pub weight: f32,
-    /// Depth of its centre along +Z, world units.
+    /// [Depth](irradia_scene::Intrinsics::depth) of its centre, world units.
     pub depth: f32,
     /// Its colour as seen from the camera, after clamping at 0.
     pub color: [f32; 3],

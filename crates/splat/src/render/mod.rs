@@ -98,7 +98,7 @@ pub struct FramePlanes<'a> {
     pub color: &'a [f32],
     /// `[H, W]`, one minus the remaining transmittance.
     pub alpha: &'a [f32],
-    /// `[H, W]`, depth along +Z accumulated with the blending weights; empty if not requested.
+    /// `[H, W]`, [depth](irradia_scene::Intrinsics::depth) accumulated with the blending weights; empty if not requested.
     pub depth: &'a [f32],
 }
 
@@ -228,8 +228,8 @@ impl Renderer {
         &self.alpha
     }
 
-    /// Depth along +Z accumulated with the blending weights, `[H, W]` (divide by alpha for the expected depth); empty if not
-    /// requested.
+    /// [Depth](irradia_scene::Intrinsics::depth) accumulated with the blending weights, `[H, W]` (divide by alpha for the expected depth);
+    /// empty if not requested.
     pub fn depth(&self) -> &[f32] {
         &self.depth
     }

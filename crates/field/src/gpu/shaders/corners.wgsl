@@ -1,4 +1,4 @@
-// The eight corners around a point of the unit cube: entries of the table and weights. Twin: `encoding::hash_grid::corners`.
+// The eight corners around a point of the unit cube: entries of the table and weights. Twin: `encoding::hash_grid::find_corners`.
 struct Corners {
     entry: array<u32, 8>,
     weight: array<f32, 8>,

@@ -49,9 +49,9 @@ struct Hit {
     color: [f32; 3],
 }
 
-/// Traces rays through random pixels of `cameras`, those for which `is_used(camera, pixel)` holds, and keeps one point per cell of the finest even grid that has at most
-/// `options.count` non-empty cells. The grid is in the field's own space, so that distant surfaces are thinned to the field's
-/// resolution there.
+/// Traces rays through random pixels of `cameras`, those for which `is_used(camera, pixel)` holds, and keeps one point per cell of the
+/// finest even grid that has at most `options.count` non-empty cells. The grid is in the field's own space, so that distant surfaces are
+/// thinned to the field's resolution there.
 pub fn to_points(
     field: &Field,
     cameras: &[Camera],

@@ -165,9 +165,13 @@ impl Journal {
     fn record_pace(&mut self, step: u64, pace: f64) {
         if self.pace != Some(pace) {
             self.pace = Some(pace);
-            let written = self.paces.write_all(Paces::line(step, pace).as_bytes());
-            self.report_failure(written, PACES);
+            self.write_pace(step, pace);
         }
+    }
+
+    fn write_pace(&mut self, step: u64, pace: f64) {
+        let written = self.paces.write_all(Paces::line(step, pace).as_bytes());
+        self.report_failure(written, PACES);
     }
 
     /// A full disk must not end the training; it is reported once.
@@ -216,6 +220,9 @@ impl Observer for Journal {
         match event {
             Event::Step(report) => {
                 self.non_finite += report.non_finite;
+                if report.step == 1 && trainer.skipped > 0.0 {
+                    self.write_pace(0, trainer.skipped);
+                }
                 self.record_pace(report.step, report.pace);
                 let interval = (trainer.total_steps() / CURVE_POINTS).max(1);
                 if self.curve.last().is_some_and(|last| report.step < last.step + interval) {

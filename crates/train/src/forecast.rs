@@ -36,6 +36,8 @@ const MAX_MEASURE_INTERVAL: usize = 16;
 const MEASURE_DIVISOR: usize = 16;
 /// Steps over which costs are averaged, but at most the last quarter, since costs change fast at first.
 const MAX_WINDOW: usize = 50;
+/// A measurement counts as at most this many times the mean: a step that was interrupted says nothing about the next ones.
+const MAX_OUTLIER: f64 = 3.0;
 /// Overdraw is not predicted to fall below this fraction of its current value.
 const MIN_OVERDRAW_FRACTION: f64 = 0.25;
 /// Growth factor of the splats added per round of `classic` in its first rounds (1.5 on chair, 2.3 on fox_colmap, of 1000 and 2000 steps).
@@ -67,7 +69,7 @@ pub fn range(left: f64, recipe: &Recipe, clock: &Clock) -> [f64; 2] {
 pub struct Forecast {
     /// Steps observed.
     steps: usize,
-    /// The trainer's seconds at the last measurement.
+    /// The seconds of the trainer's steps at the last measurement.
     seconds: f64,
     /// Steps since then.
     since: usize,
@@ -147,14 +149,13 @@ impl Forecast {
                 self.overdraws
                     .resize(self.overdraws.len() + self.steps - before, overdraw);
             }
-            let seconds = (trainer.seconds - self.seconds) / self.since as f64;
+            let seconds = (step_seconds(trainer) - self.seconds) / self.since as f64;
             let work_seconds = seconds / self.work(trainer, &step, count, pairs);
-            self.work_seconds = Some(
-                self.work_seconds
-                    .map_or(work_seconds, |mean| mean + share * (work_seconds - mean)),
-            );
+            self.work_seconds = Some(self.work_seconds.map_or(work_seconds, |mean| {
+                mean + share * (work_seconds.min(MAX_OUTLIER * mean) - mean)
+            }));
         }
-        (self.seconds, self.since) = (trainer.seconds, 0);
+        (self.seconds, self.since) = (step_seconds(trainer), 0);
         let upcoming = upcoming(&trainer.recipe, &trainer.clock, FORECAST_PARTS);
         self.next = upcoming.first().map(|next| (*next, trainer.engine.len() as f64));
         self.rest_seconds = self.predict(trainer, &upcoming);
@@ -252,15 +253,22 @@ impl Forecast {
 
     /// Seconds that the rest of the run takes at its current pace.
     pub fn seconds_left(&self, trainer: &Trainer) -> f64 {
-        (self.rest_seconds / trainer.pace - (trainer.seconds - self.seconds)).max(0.0)
+        (self.rest_seconds / trainer.pace - (step_seconds(trainer) - self.seconds)).max(0.0)
     }
 
     /// The pace at which the rest of the run takes `seconds`.
     pub fn pace(&self, trainer: &Trainer, seconds: f64) -> f64 {
         let left = trainer.recipe.total_steps() as f64 - trainer.clock.time;
+        let audits = trainer.audit_steps() * self.rest_seconds / left;
         // At least one more step, even without time left.
-        (self.rest_seconds / seconds.max(1e-6)).min(left)
+        (self.rest_seconds / (seconds - audits).max(1e-6)).min(left)
     }
+}
+
+/// Seconds of the trainer's steps, without the renders between them: those of all views for an audit would make the next steps look as
+/// expensive.
+fn step_seconds(trainer: &Trainer) -> f64 {
+    trainer.seconds - trainer.seconds_between
 }
 
 /// Number of recent steps to average over.

@@ -56,6 +56,10 @@ const MAX_EVALUATED: usize = 32;
 /// Interval at which observers of a paused run are polled: imperceptible to a person, and a negligible load.
 const PAUSE_INTERVAL: Duration = Duration::from_millis(20);
 
+/// Pace of a run that continues a scene and skips the beginning of its recipe, relative to a run of full length: higher paces than 1 also
+/// repeat some of the growth.
+const CONTINUED_PACE: f64 = 2.0;
+
 /// The combined requests of the observers.
 #[derive(Clone, Copy, Default)]
 struct Requests {
@@ -84,6 +88,9 @@ pub fn run(
     limits: &RunLimits,
     observers: &mut [&mut dyn Observer],
 ) -> Result<EndReason, TrainError> {
+    if trainer.clock.step == 0 {
+        skip_beginning(trainer, limits)?;
+    }
     let mut events = begin_events(trainer);
     let mut forecast = Forecast::default();
     let mut requests = notify(trainer, &mut events, observers);
@@ -152,6 +159,27 @@ pub fn run(
         notify(trainer, &mut events, observers);
     }
     Ok(reason)
+}
+
+/// Skips the beginning of the recipe if the run continues a scene and is shorter than the recipe, whose first rates would undo more than a
+/// short run can repair.
+fn skip_beginning(trainer: &mut Trainer, limits: &RunLimits) -> Result<(), TrainError> {
+    let total = trainer.recipe.total_steps() as f64;
+    let pace = CONTINUED_PACE * trainer.min_pace().max(1.0);
+    let skipped = match (&limits.paces, trainer.options.steps, limits.budget) {
+        (Some(paces), ..) => paces.skipped(),
+        _ if !trainer.continues_scene => 0.0,
+        (_, Some(steps), _) => total - pace * steps as f64,
+        (.., Some(budget)) => total - pace * trainer.steps_within(budget)?.max(1.0),
+        _ => 0.0,
+    };
+    if skipped >= 1.0 {
+        trainer.skip(skipped);
+        trainer.decisions.push(format!(
+            "the run continues a scene and is shorter than the recipe: it skips the first {skipped:.0} of {total:.0} steps"
+        ));
+    }
+    Ok(())
 }
 
 /// The events before the first step of this process. The trainer's decisions are reported once.

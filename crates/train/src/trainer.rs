@@ -134,6 +134,10 @@ pub struct Trainer {
     pub options: TrainOptions,
     /// Recipe steps per step.
     pub pace: f64,
+    /// Recipe steps skipped before the first step.
+    pub skipped: f64,
+    /// Whether the first splats are those of a scene.
+    pub(crate) continues_scene: bool,
     /// Extent of the scene, world units: 1.1 times the largest distance of a camera from their mean (3DGS).
     pub extent: f32,
     /// The length that counts as much as one radian, or as one unit of a splat's size, world units: the extent, but at most the depth of what
@@ -146,6 +150,8 @@ pub struct Trainer {
     pub seconds: f64,
     /// CPU time of all steps so far, over all threads.
     pub cpu_seconds: f64,
+    /// The part of `seconds` in this process that rendered views between steps.
+    pub(crate) seconds_between: f64,
     /// Wall time between the first step and the last, and its breakdown.
     pub times: Times,
     /// Maximum number of splats: the recipe's limits for this dataset, and those of the memory and the device.
@@ -218,7 +224,17 @@ impl Trainer {
         trainer.apply_data_conditions()?;
         *trainer.engine.state_mut() = SplatState::new(splats);
         trainer.sockets = trainer.first_sockets()?;
+        trainer.continues_scene = true;
         Ok(trainer)
+    }
+
+    /// Skips the first `time` recipe steps; the steps of the run are those that remain.
+    pub(crate) fn skip(&mut self, time: f64) {
+        self.clock.advance(&self.recipe, time);
+        self.skipped = time;
+        if let Some(steps) = self.options.steps {
+            self.pace = (self.recipe.total_steps() as f64 - time) / steps.max(1) as f64;
+        }
     }
 
     /// A trainer whose state is yet to be filled in with `first_splats` splats, by a checkpoint for example.
@@ -253,8 +269,11 @@ impl Trainer {
         Ok(Self {
             clock: Clock::new(&recipe),
             pace: options.steps.map_or(1.0, |steps| total / steps.max(1) as f64),
+            skipped: 0.0,
+            continues_scene: false,
             seconds: 0.0,
             cpu_seconds: 0.0,
+            seconds_between: 0.0,
             times: Times::default(),
             extent,
             length_unit: extent.min(content_depth(&dataset)),
@@ -472,7 +491,9 @@ impl Trainer {
             };
             self.sockets.render(&mut self.engine, view, placement, &options, plan);
             visit(self, view, &photo);
-            self.seconds += started.elapsed().as_secs_f64();
+            let seconds = started.elapsed().as_secs_f64();
+            self.seconds += seconds;
+            self.seconds_between += seconds;
             self.cpu_seconds += cpu_started.elapsed().as_secs_f64();
         }
         Ok(())

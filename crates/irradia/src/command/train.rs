@@ -35,7 +35,7 @@ pub struct Args {
     #[arg(long, value_name = "NAME|FILE", default_value = DEFAULT_RECIPE, conflicts_with = "resume")]
     pub recipe: String,
     /// Begin with the splats of this scene, a file or the folder of a run, instead of points; its coordinates must be those of the dataset.
-    /// If photographs were posed for that run, these poses are used again
+    /// Fewer steps than the recipe has are its last ones. If photographs were posed for that run, these poses are used again
     #[arg(long, value_name = "SCENE", conflicts_with = "resume")]
     pub from: Option<PathBuf>,
     /// Poses to use: those given with the photographs, or new ones by irradia, or by colmap, if it is installed. When absent the given

@@ -195,6 +195,34 @@ fn a_run_with_a_budget_is_repeated_bit_for_bit() {
 }
 
 #[test]
+fn a_short_run_from_a_scene_ends_like_a_long_one_and_is_repeated_bit_for_bit() {
+    let folder = with_data();
+    irradia(folder.path(), "train data --out run --steps 60").success();
+    irradia(folder.path(), "train data --from run --out next --steps 20").success();
+    irradia(folder.path(), "train --replay next --out again").success();
+    let [run, next, again] = ["run", "next", "again"].map(|name| folder.path().join(name));
+    assert!(scene(&next) == scene(&again) && scene(&next) != scene(&run));
+    let paces = |run: &Path| std::fs::read_to_string(run.join("pace.txt")).expect("paces");
+    let lines = paces(&next);
+    let values: Vec<f64> = lines
+        .split_whitespace()
+        .map(|word| word.parse().expect("a number"))
+        .collect();
+    let [0.0, skipped, 1.0, pace] = values[..] else {
+        panic!("{lines}");
+    };
+    assert!(
+        skipped > 2500.0 && (skipped + 20.0 * pace - 3000.0).abs() < 1e-6,
+        "{lines}"
+    );
+    assert_eq!(paces(&again), lines);
+    let psnr = |run: &Path| json(&run.join("report.json"))["psnr"].as_f64().expect("held-out views");
+    assert!(psnr(&next) > psnr(&run), "{} after {}", psnr(&next), psnr(&run));
+    irradia(folder.path(), "train data --from run --out timed --budget 1s").success();
+    assert!(psnr(&folder.path().join("timed")) > psnr(&run));
+}
+
+#[test]
 fn after_repeated_kills_it_ends_with_the_same_bytes() {
     let folder = with_data();
     let line = "train data --steps 150 --seed 3 --set checkpoint_every=5";

@@ -180,7 +180,7 @@ impl Clock {
     }
 
     /// Advances `time` without a step.
-    fn advance(&mut self, recipe: &Recipe, time: f64) {
+    pub(crate) fn advance(&mut self, recipe: &Recipe, time: f64) {
         let before = values(recipe, self);
         self.time += time;
         self.progress += time * self.stretch;

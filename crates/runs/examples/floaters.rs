@@ -15,8 +15,7 @@ use irradia_runs::{Editing, SCENE, Scene, TrainInput, evaluate};
 use irradia_scene::{Camera, Dataset, GaussianCloud, Rng, sh};
 use irradia_splat::init::focus_point;
 use irradia_splat::{Splats, logit};
-use irradia_train::eval::{EvalOptions, Metrics};
-use irradia_train::half_fit::HalfFit;
+use irradia_train::eval::EvalOptions;
 use irradia_train::model::Model;
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -94,13 +93,7 @@ fn without_floaters(draft: &Draft, scores: &[FloaterScores]) -> GaussianCloud {
 }
 
 fn held_out_psnr(cloud: &GaussianCloud, scene: &Scene, dataset: &Dataset) -> Result<f64, Box<dyn Error>> {
-    let options = EvalOptions {
-        render: scene.options,
-        metrics: Metrics::Psnr,
-        half_fit: HalfFit::default(),
-        vignette: None,
-        device: &irradia_compute::Device::Cpu,
-    };
+    let options = EvalOptions::psnr(scene.options, None, &irradia_compute::Device::Cpu);
     let model = Model::of_splats(Splats::from_cloud(cloud));
     let mean = evaluate(&model, dataset, &dataset.test, &options, |_| {
         Ok::<(), irradia_runs::RunError>(())

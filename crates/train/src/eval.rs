@@ -68,6 +68,19 @@ pub struct EvalOptions<'a> {
     pub device: &'a Device,
 }
 
+impl<'a> EvalOptions<'a> {
+    /// Measures PSNR only, and fits nothing.
+    pub fn psnr(render: RenderOptions, vignette: Option<&'a Vignette>, device: &'a Device) -> Self {
+        Self {
+            render,
+            metrics: Metrics::Psnr,
+            half_fit: HalfFit::default(),
+            vignette,
+            device,
+        }
+    }
+}
+
 /// Renders `model` from the views `indices` of `dataset` and compares the frames with their photographs; passes each result to `visit`,
 /// which may end the evaluation.
 ///

@@ -1,9 +1,8 @@
 //! The loop around [`Trainer::step`]: when to stop and to evaluate, and events to observers.
 
-use crate::eval::{EvalOptions, Metrics, evaluate_views, mean};
+use crate::eval::{EvalOptions, evaluate_views, mean};
 use crate::event::{Event, Observer, Signal, StepReport};
 use crate::forecast::{self, Forecast};
-use crate::half_fit::HalfFit;
 use crate::paces::Paces;
 use crate::schedule::{is_due, plan};
 use crate::trainer::{TrainError, Trainer};
@@ -341,13 +340,8 @@ fn evenly_spaced(views: &[usize]) -> Vec<usize> {
 /// Mean PSNR over the held-out `views`, with the SH bands currently in use; NaN if none could be measured or an observer
 /// requests a stop meanwhile.
 fn held_out_psnr(trainer: &Trainer, views: &[usize], observers: &[&mut dyn Observer]) -> Result<f64, TrainError> {
-    let options = EvalOptions {
-        render: trainer.render_options(plan(&trainer.recipe, &trainer.clock).sh_degree),
-        metrics: Metrics::Psnr,
-        half_fit: HalfFit::default(),
-        vignette: trainer.sockets.vignette.as_ref(),
-        device: &trainer.options.device,
-    };
+    let render = trainer.render_options(plan(&trainer.recipe, &trainer.clock).sh_degree);
+    let options = EvalOptions::psnr(render, trainer.sockets.vignette.as_ref(), &trainer.options.device);
     let (mut metrics, mut stopped) = (Vec::new(), false);
     evaluate_views(&trainer.scene(), &trainer.dataset, views, &options, |view| {
         metrics.push(view.metrics);

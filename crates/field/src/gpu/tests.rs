@@ -89,6 +89,18 @@ impl Photographs {
             })
             .collect()
     }
+
+    /// 200 random rays, `known` of them through known depths.
+    fn batch(&self, known: usize, space: &Space) -> RayBatch {
+        let mut batch = RayBatch::default();
+        let what = Draw {
+            rays: 200,
+            known,
+            background: Background::Random,
+        };
+        batch.draw(&self.views(), &what, space, &mut Rng::new(1, 1));
+        batch
+    }
 }
 
 /// Fields of every space and activation, with and without a learnt background.
@@ -161,13 +173,7 @@ fn a_step_has_the_gradients_and_losses_of_the_cpu() {
     let photographs = Photographs::new();
     for (name, config, space) in variants() {
         let mut cpu = state(config, space);
-        let mut batch = RayBatch::default();
-        let what = Draw {
-            rays: 200,
-            known: 50,
-            background: Background::Random,
-        };
-        batch.draw(&photographs.views(), &what, &space, &mut Rng::new(1, 1));
+        let batch = photographs.batch(50, &space);
         let options = StepOptions {
             depth: 0.1,
             ..StepOptions::default()
@@ -211,13 +217,7 @@ fn rays_beyond_the_most_samples_are_left_out() {
     let photographs = Photographs::new();
     let (_, config, space) = variants().into_iter().next().expect("a variant");
     let mut state = state(config, space);
-    let mut batch = RayBatch::default();
-    let what = Draw {
-        rays: 200,
-        known: 0,
-        background: Background::Random,
-    };
-    batch.draw(&photographs.views(), &what, &space, &mut Rng::new(1, 1));
+    let batch = photographs.batch(0, &space);
     let options = StepOptions {
         samples: 50,
         ..StepOptions::default()

@@ -8,8 +8,7 @@ use irradia_formats::{SogDetail, SplatFormat, WriteOptions, round_trip};
 use irradia_scene::{Camera, Dataset, GaussianCloud, Similarity};
 use irradia_splat::contribution::{Contributions, contributions};
 use irradia_splat::{SplatState, Splats};
-use irradia_train::eval::{EvalOptions, Metrics};
-use irradia_train::half_fit::HalfFit;
+use irradia_train::eval::EvalOptions;
 use irradia_train::memory::default_limit;
 use irradia_train::model::{Model, RenderOptions};
 use irradia_train::recipe::Param;
@@ -116,13 +115,7 @@ impl Measure {
     }
 
     fn mean_psnr(&self, model: &Model, views: &[usize]) -> Result<f64, RunError> {
-        let options = EvalOptions {
-            render: self.options,
-            metrics: Metrics::Psnr,
-            half_fit: HalfFit::default(),
-            vignette: self.vignette.as_ref(),
-            device: &Device::Cpu,
-        };
+        let options = EvalOptions::psnr(self.options, self.vignette.as_ref(), &Device::Cpu);
         Ok(evaluate::<RunError>(model, &self.dataset, views, &options, |_| Ok(()))?.psnr)
     }
 }

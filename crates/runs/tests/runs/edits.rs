@@ -7,9 +7,8 @@ use irradia_runs::formats::{WriteOptions, read_splats, write_splats};
 use irradia_runs::prelude::*;
 use irradia_runs::scene::{GaussianCloud, Rng, sh};
 use irradia_runs::synth::{SceneName, SynthLens, dataset as traced};
-use irradia_runs::train::eval::{EvalOptions, Metrics};
+use irradia_runs::train::eval::EvalOptions;
 use irradia_runs::train::event::{Event, Observer, Signal};
-use irradia_runs::train::half_fit::HalfFit;
 use irradia_runs::train::schedule::plan;
 use irradia_runs::{EDITS, Editing, ReadingOptions, convert, is_moved};
 use irradia_splat::logit;
@@ -32,13 +31,7 @@ fn edited(input: &Path, lines: &[&str]) -> Editing {
 
 /// The mean PSNR of held-out views, dB.
 fn held_out_psnr(scene: &Scene, data: &Dataset) -> Result<f64, RunError> {
-    let options = EvalOptions {
-        render: scene.options,
-        metrics: Metrics::Psnr,
-        half_fit: HalfFit::default(),
-        vignette: None,
-        device: &irradia_compute::Device::Cpu,
-    };
+    let options = EvalOptions::psnr(scene.options, None, &irradia_compute::Device::Cpu);
     evaluate(&scene.model, data, &data.test, &options, |_| Ok::<(), RunError>(())).map(|mean| mean.psnr)
 }
 

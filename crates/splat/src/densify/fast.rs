@@ -134,8 +134,7 @@ mod tests {
                 state.statistics.set(plane, at, value);
             }
         }
-        let options = OPTIONS;
-        let change = densify(&mut state, &options);
+        let change = densify(&mut state, &OPTIONS);
         assert_eq!(
             (change.split, change.pruned, state.len()),
             (1, 1, 4),

@@ -129,7 +129,7 @@ fn fixed_calibration(header: &str) -> Result<Option<[f64; 4]>, Malformed> {
 }
 
 fn parse_image(line: &str) -> Result<NvmImage, Malformed> {
-    // A name may have spaces, so the numbers are counted from the end.
+    // Some programs write spaces in names, so the numbers are counted from the end.
     let words: Vec<&str> = line.split_whitespace().collect();
     let Some(length) = words.len().checked_sub(NUMBERS_PER_IMAGE).filter(|length| *length > 0) else {
         return Err(Malformed(format!(
@@ -139,7 +139,8 @@ fn parse_image(line: &str) -> Result<NvmImage, Malformed> {
     let numbers = words[length..].join(" ");
     let [focal, w, x, y, z, cx, cy, cz, radial, _] = Tokens::new(&numbers).numbers("a number of a photograph")?;
     Ok(NvmImage {
-        name: words[..length].join(" "),
+        // VisualSfM itself writes `"` for a space.
+        name: words[..length].join(" ").replace('"', " "),
         focal: [focal; 2],
         principal: None,
         rotation: [w, x, y, z],
@@ -179,6 +180,15 @@ fn declared_camera(image: &NvmImage) -> DeclaredCamera {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn names_with_spaces_are_read_as_they_are_written() {
+        for written in ["my photo 1.jpg", "my\"photo\"1.jpg"] {
+            let text = format!("NVM_V3\n\n1\n{written} 400 1 0 0 0 1 2 3 0.1 0\n\n0\n0\n");
+            let models = parse_nvm(text.as_bytes()).unwrap();
+            assert_eq!(models[0].images[0].name, "my photo 1.jpg", "{written}");
+        }
+    }
 
     #[test]
     fn a_fixed_calibration_is_that_of_all_photographs() {

@@ -86,8 +86,9 @@ pub(super) fn declared_views(
     root: &Path,
     transforms: &Transforms,
 ) -> Result<Vec<DeclaredView>, FormatError> {
-    let set =
-        |names: &Option<Vec<String>>| -> HashSet<String> { names.iter().flatten().map(|n| n.to_owned()).collect() };
+    // Paths are compared, not texts: `./images/a.png` is `images/a.png`.
+    let path_of = |name: &str| relative_name(Path::new(""), Path::new(&name.replace('\\', "/")));
+    let set = |names: &Option<Vec<String>>| -> HashSet<String> { names.iter().flatten().map(|n| path_of(n)).collect() };
     let train = set(&transforms.train_filenames);
     // If a dataset lists only validation frames, those are held out.
     let (test, validation) = (set(&transforms.test_filenames), set(&transforms.val_filenames));
@@ -97,6 +98,7 @@ pub(super) fn declared_views(
         (test, validation)
     };
     let split_of = |name: &String| {
+        let name = &path_of(name);
         if train.is_empty() && test.is_empty() {
             None
         } else if test.contains(name) {
@@ -144,4 +146,23 @@ pub(super) fn declared_views(
             })
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lists_name_frames_however_their_paths_are_written() {
+        let text = br#"{"fl_x": 50, "frames": [
+            {"file_path": "./images/a.png", "transform_matrix": []},
+            {"file_path": "images\\b.png", "transform_matrix": []},
+            {"file_path": "images/c.png", "transform_matrix": []}],
+            "train_filenames": ["images/a.png", "images/c.png"], "test_filenames": ["./images/b.png"]}"#;
+        let transforms = parse_transforms(text).unwrap();
+        let root = Path::new("absent");
+        let views = declared_views(&root.join("transforms.json"), root, &transforms).unwrap();
+        let splits: Vec<_> = views.iter().map(|view| view.split).collect();
+        assert_eq!(splits, [Some(Split::Train), Some(Split::Test), Some(Split::Train)]);
+    }
 }

@@ -396,19 +396,43 @@ fn sog_meta(path: &Path) -> PathBuf {
     }
 }
 
-/// The content of the file `name` to which the file `path` refers; it must be in the folder of `path` or below.
-fn read_sibling_file(path: &Path, name: &str) -> Result<Vec<u8>, Malformed> {
-    let relative = Path::new(name);
-    let is_below = relative
-        .components()
-        .all(|part| matches!(part, std::path::Component::Normal(_)));
-    if !is_below || name.contains([':', '\\']) {
+/// The content of the file to which the file `path` refers by the URI `uri`; it must be in the folder of `path` or below. A file of the
+/// very name of the URI takes precedence, since not all programs escape names.
+fn read_sibling_file(path: &Path, uri: &str) -> Result<Vec<u8>, Malformed> {
+    let is_below = |name: &str| {
+        let mut parts = Path::new(name).components();
+        parts.all(|part| matches!(part, std::path::Component::Normal(_))) && !name.contains([':', '\\'])
+    };
+    let names = [uri.to_owned(), unescaped(uri)];
+    if !names.iter().all(|name| is_below(name)) {
         return Err(Malformed(format!(
             "refers to the file {}, which is not in its folder",
-            crate::zip::printable(name)
+            crate::zip::printable(uri)
         )));
     }
-    read_file(&path.with_file_name("").join(relative)).map_err(|error| Malformed(error.to_string()))
+    let [literal, unescaped] = names.map(|name| path.with_file_name("").join(name));
+    let file = if literal.is_file() { literal } else { unescaped };
+    read_file(&file).map_err(|error| Malformed(error.to_string()))
+}
+
+/// A URI without escapes: `%20` stands for a space (RFC 3986, section 2.1). What is no escape stays.
+fn unescaped(uri: &str) -> String {
+    let mut bytes = Vec::with_capacity(uri.len());
+    let mut rest = uri.as_bytes();
+    while let [first, after @ ..] = rest {
+        let digit = |at: usize| char::from(*after.get(at)?).to_digit(16);
+        match digit(0).zip(digit(1)).filter(|_| *first == b'%') {
+            Some((high, low)) => {
+                bytes.push((16 * high + low) as u8);
+                rest = &after[2..];
+            }
+            None => {
+                bytes.push(*first);
+                rest = after;
+            }
+        }
+    }
+    String::from_utf8_lossy(&bytes).into_owned()
 }
 
 /// Size on disk of the scene `path`, bytes; a file or a folder of SOG images.
@@ -592,5 +616,28 @@ fn points(cloud: &GaussianCloud) -> PointCloud {
         colors: colors
             .map(|sh| [0, 1, 2].map(|c| quantize::color_byte(sh[c])))
             .collect(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn files_beside_a_document_are_found_by_escaped_and_plain_names() {
+        let folder = tempfile::tempdir().unwrap();
+        let document = folder.path().join("a.gltf");
+        for name in ["my scene é.bin", "100%25.bin"] {
+            fs::write(folder.path().join(name), name).unwrap();
+        }
+        let read = |uri: &str| read_sibling_file(&document, uri).map(|bytes| String::from_utf8(bytes).unwrap());
+        assert_eq!(read("my%20scene%20%C3%A9.bin").unwrap(), "my scene é.bin");
+        assert_eq!(read("my scene é.bin").unwrap(), "my scene é.bin");
+        assert_eq!(read("100%25.bin").unwrap(), "100%25.bin");
+        assert_eq!(unescaped("%zz%2"), "%zz%2");
+        for uri in ["%2e%2e/a.bin", "%2Fetc%2Fpasswd", "..%2fa.bin", "C%3A/a.bin", "a%5Cb"] {
+            let error = read(uri).unwrap_err().to_string();
+            assert!(error.contains("not in its folder"), "{uri}: {error}");
+        }
     }
 }

@@ -108,7 +108,7 @@ pub(crate) struct Column {
 impl<'a> Ply<'a> {
     pub fn parse(bytes: &'a [u8]) -> Result<Self, Malformed> {
         let mut rest = bytes;
-        if next_line(&mut rest) != Some("ply") {
+        if next_line(&mut rest).as_deref() != Some("ply") {
             return Err(Malformed("not a PLY file: its first line is not `ply`".into()));
         }
         let mut encoding = None;
@@ -120,7 +120,7 @@ impl<'a> Ply<'a> {
                     "the PLY header has no `end_header`; the file is damaged".into(),
                 ));
             };
-            let invalid_line = || Malformed(format!("the PLY header line `{}` is not understood", excerpt(line)));
+            let invalid_line = || Malformed(format!("the PLY header line `{}` is not understood", excerpt(&line)));
             let words: Vec<&str> = line.split_ascii_whitespace().collect();
             match words[..] {
                 ["end_header"] => break,
@@ -426,11 +426,12 @@ fn push_number(packed: &mut Vec<u8>, scalar: Scalar, word: &str) -> Result<(), M
     Ok(())
 }
 
-fn next_line<'a>(rest: &mut &'a [u8]) -> Option<&'a str> {
+/// The next line of a header, without white space at its end. Comments may be in any encoding: what is not UTF-8 is replaced.
+fn next_line<'a>(rest: &mut &'a [u8]) -> Option<Cow<'a, str>> {
     let end = rest.iter().take(MAX_HEADER_BYTES).position(|byte| *byte == b'\n')?;
-    let line = std::str::from_utf8(&rest[..end]).ok()?;
+    let line = String::from_utf8_lossy(rest[..end].trim_ascii_end());
     *rest = &rest[end + 1..];
-    Some(line.trim_end())
+    Some(line)
 }
 
 fn excerpt(text: &str) -> String {

@@ -114,6 +114,13 @@ mod tests {
     }
 
     #[test]
+    fn comments_may_be_in_any_encoding() {
+        let mut bytes = b"ply\nformat ascii 1.0\ncomment made from C:\\B\xfcro \nelement vertex 1\n".to_vec();
+        bytes.extend(b"property float x\nproperty float y\nproperty float z\nend_header\n1 2 3\n");
+        assert_eq!(parse_points_ply(&bytes).unwrap().positions, [Vec3::new(1.0, 2.0, 3.0)]);
+    }
+
+    #[test]
     fn binary_in_both_byte_orders_with_a_list_before_the_vertices() {
         for big in [false, true] {
             let f = |v: f32| if big { v.to_be_bytes() } else { v.to_le_bytes() };

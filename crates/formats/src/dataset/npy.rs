@@ -2,6 +2,7 @@
 //! <https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html>
 
 use crate::Malformed;
+use irradia_scene::half::from_half;
 
 /// A `[rows, columns]` array, row-major.
 pub(crate) struct Table {
@@ -10,7 +11,7 @@ pub(crate) struct Table {
     pub values: Vec<f64>,
 }
 
-/// Parses an `.npy` file of version 1 to 3 with two dimensions of 4- or 8-byte floats.
+/// Parses an `.npy` file of version 1 to 3 with two dimensions of 2-, 4- or 8-byte floats, and any number of dimensions of length 1.
 pub(crate) fn parse_table(bytes: &[u8]) -> Result<Table, Malformed> {
     let malformed = |reason: &str| Malformed(format!("not a usable .npy file: {reason}"));
     let rest = bytes
@@ -34,16 +35,24 @@ pub(crate) fn parse_table(bytes: &[u8]) -> Result<Table, Malformed> {
         ">f8" => (8, true),
         "<f4" => (4, false),
         ">f4" => (4, true),
-        _ => return Err(malformed(&format!("its type is {kind}, not f8 or f4"))),
+        "<f2" => (2, false),
+        ">f2" => (2, true),
+        _ => return Err(malformed(&format!("its type is {kind}, not f8, f4 or f2"))),
     };
     let shape = header_value(&header, "shape").unwrap_or_default();
-    let sizes: Option<Vec<usize>> = shape
+    let mut sizes: Option<Vec<usize>> = shape
         .trim_matches(['(', ')'])
         .split(',')
         .map(str::trim)
         .filter(|s| !s.is_empty())
         .map(|s| s.parse().ok())
         .collect();
+    if let Some(sizes) = &mut sizes
+        && sizes.len() > 2
+    {
+        // An image of one channel is `(H, W, 1)`, a batch of one `(1, H, W)`.
+        sizes.retain(|size| *size != 1);
+    }
     let Some([rows, columns]) = sizes.as_deref() else {
         return Err(malformed(&format!("its shape is {shape}, not two numbers")));
     };
@@ -64,6 +73,7 @@ pub(crate) fn parse_table(bytes: &[u8]) -> Result<Table, Malformed> {
         }
         match size {
             8 => f64::from_le_bytes(native),
+            2 => f64::from(from_half(u16::from_le_bytes([native[0], native[1]]))),
             _ => f64::from(f32::from_le_bytes([native[0], native[1], native[2], native[3]])),
         }
     };
@@ -129,6 +139,28 @@ mod tests {
         let floats: Vec<u8> = [1.5f32, -2.0].iter().flat_map(|v| v.to_be_bytes()).collect();
         let header = "{'descr':'>f4','fortran_order':False,'shape':(1,2)}";
         assert_eq!(parse_table(&file(3, header, &floats)).unwrap().values, [1.5, -2.0]);
+    }
+
+    #[test]
+    fn dimensions_of_one_and_halves_are_read() {
+        let halves: Vec<u8> = [0x3c00u16, 0xc000, 0x3555, 0x7c00]
+            .iter()
+            .flat_map(|v| v.to_le_bytes())
+            .collect();
+        for shape in ["(2, 2)", "(2, 2, 1)", "(1, 2, 2)", "(1, 2, 1, 2, 1)"] {
+            let header = format!("{{'descr': '<f2', 'fortran_order': False, 'shape': {shape}, }}");
+            let table = parse_table(&file(1, &header, &halves)).unwrap();
+            assert_eq!(
+                (table.rows, table.columns, &table.values[..2]),
+                (2, 2, &[1.0, -2.0][..]),
+                "{shape}"
+            );
+            assert!((table.values[2] - 1.0 / 3.0).abs() < 1e-4 && table.values[3] == f64::INFINITY);
+        }
+        for shape in ["(2, 2, 2)", "(4, 1, 1)"] {
+            let header = format!("{{'descr': '<f2', 'fortran_order': False, 'shape': {shape}, }}");
+            assert!(parse_table(&file(1, &header, &halves)).is_err(), "{shape}");
+        }
     }
 
     #[test]

@@ -76,10 +76,11 @@ impl Journal {
             failed: false,
             warning: None,
         };
-        let text = fs::read_to_string(&path).unwrap_or_default();
+        let bytes = fs::read(&path).unwrap_or_default();
+        let text = String::from_utf8_lossy(&bytes);
         let mut kept = String::new();
         for line in text.lines() {
-            // A line truncated by a power failure is not JSON: it and all later ones are removed.
+            // A line truncated by a power failure, perhaps within a character, is not JSON: it and all later ones are removed.
             let Ok(value) = serde_json::from_str::<serde_json::Value>(line) else {
                 break;
             };
@@ -93,7 +94,7 @@ impl Journal {
             kept.push('\n');
         }
         // The last line may also have lost its end only, and the next event would continue it.
-        if kept != text {
+        if kept.as_bytes() != bytes {
             folder.write("events.jsonl", kept.as_bytes())?;
             journal.events = open_for_append(&path)?;
         }
@@ -276,7 +277,8 @@ impl Observer for Journal {
 
 /// Mean squared errors of the training views that the run in `folder` logged, step by step; empty without a log.
 pub fn logged_errors(folder: &Path) -> Vec<f64> {
-    let text = fs::read_to_string(folder.join("events.jsonl")).unwrap_or_default();
+    let bytes = fs::read(folder.join("events.jsonl")).unwrap_or_default();
+    let text = String::from_utf8_lossy(&bytes);
     let events = text
         .lines()
         .filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok());
@@ -308,6 +310,16 @@ mod tests {
             (kept, journal.warnings, journal.stages.len(), journal.curve.len())
         };
         assert_eq!(resumed(5), (3, vec!["little memory".to_owned()], 1, 1));
+        // A line that ends within a character.
+        let cut = [
+            lines.join("\n").as_bytes(),
+            b"\n{\"event\":\"warned\",\"message\":\"\xc3",
+        ]
+        .concat();
+        fs::write(&path, cut).unwrap();
+        let journal = Journal::open(&RunFolder::at(folder.path()), 9).unwrap();
+        assert_eq!((journal.warnings.len(), journal.curve.len()), (2, 2));
+        assert_eq!(fs::read_to_string(&path).unwrap().lines().count(), lines.len());
         // They are reported again by the run that begins again.
         assert_eq!(resumed(0), (0, Vec::new(), 0, 0));
     }

@@ -165,7 +165,7 @@ pub fn run(args: &Args) -> Result<()> {
                 RunFolder::check_free(&request.input().out, request.input().overwrite)?;
                 return begin_on(request, dataset, args.viewer());
             }
-            if is_unposed(&input.data) {
+            if finds_poses(&input) {
                 // Posing takes a while: mistakes are reported first.
                 input.clone().check().map_err(with_option_names)?;
                 RunFolder::check_free(&input.out, input.overwrite)?;
@@ -180,6 +180,11 @@ pub fn run(args: &Args) -> Result<()> {
             begin_on(request, dataset, args.viewer())
         }
     }
+}
+
+/// Whether poses are found first, since the data are photographs or films without any. A requested layout says that there are some.
+fn finds_poses(input: &TrainInput) -> bool {
+    input.reading.format.is_none() && is_unposed(&input.data)
 }
 
 /// The input that repeats `run`.
@@ -256,7 +261,7 @@ fn with_poses_of(from: &Path, mut input: TrainInput, poses: Option<PosesArg>) ->
         let message = format!("--poses: new poses do not fit the splats of {scene}: omit it, or omit --from");
         return Err(Usage(message).into());
     }
-    let given = (!is_unposed(&input.data)).then(|| read(input.clone())).transpose()?;
+    let given = (!finds_poses(&input)).then(|| read(input.clone())).transpose()?;
     let fits = |dataset: &Dataset| moved_from_dataset(&scene_path(from), dataset).is_some();
     match (given, RunFolder::posed_dataset(from)) {
         (Some(given), _) if fits(&given.1) => Ok(given),

@@ -99,6 +99,9 @@ fn a_folder_without_a_dataset_gets_the_list_of_known_layouts() {
     irradia(folder.path(), "train nowhere --out run").refused(1, &["nowhere"]);
     irradia(folder.path(), "train . --out run").refused(1, &["transforms.json", "sparse/0", "poses_bounds.npy"]);
     irradia(folder.path(), "train data --out run --format colmap").refused(1, &["data", "COLMAP"]);
+    // Photographs without poses are not posed if a layout is requested.
+    irradia(folder.path(), "train data/train --out run --format nerfstudio")
+        .refused(1, &["data/train", "transforms.json"]);
     irradia(folder.path(), "train --resume nowhere").refused(1, &["nowhere", "no run"]);
     irradia(folder.path(), "info nowhere.ply").refused(1, &["nowhere.ply"]);
     assert!(!folder.path().join("run").exists());

@@ -72,6 +72,14 @@ impl FilmWriter {
     /// Begins a film of frames with `width` x `height` pixels.
     pub fn begin(path: &Path, (width, height): (u32, u32), fps: f32) -> Result<Self> {
         let name = path.file_name().context("a film needs a file name")?.to_string_lossy();
+        if path.is_dir() {
+            // Renaming would fail after the last frame.
+            return Err(Usage(format!(
+                "{} is a folder: choose another name for the film",
+                path.display()
+            ))
+            .into());
+        }
         let unfinished = path.with_file_name(format!(".{name}.{}.tmp", std::process::id()));
         let encoder = match kind(path) {
             Some("gif") => gif_encoder(&unfinished, width, height, fps)?,

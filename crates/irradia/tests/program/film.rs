@@ -53,12 +53,18 @@ fn a_saved_path_shows_the_same_of_a_scene_that_was_moved() {
 fn paths_that_cannot_be_followed_are_refused_in_one_line() {
     let folder = with_run();
     fs::write(folder.path().join("path.json"), "{\"camera_path\": 3}").expect("written");
+    fs::create_dir(folder.path().join("folder.gif")).expect("a folder");
     for (command, code, parts) in [
         ("render run --path none.json --out x", 1, &["none.json"][..]),
         ("render run --path path.json --out x", 1, &["path.json"]),
         ("render run --path orbit --frames 0 --out x", 2, &["--frames"]),
         ("render run --path orbit --depth --out x.gif", 2, &["depth"]),
         ("render run --orbit 3 --path orbit --out x", 2, &["--path"]),
+        (
+            "render run --orbit 3 --out folder.gif",
+            2,
+            &["folder.gif", "is a folder"],
+        ),
     ] {
         irradia(folder.path(), command).refused(code, parts);
     }

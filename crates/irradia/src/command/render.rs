@@ -9,7 +9,7 @@ use anyhow::{Context, Result};
 use irradia_edit::Transform;
 use irradia_runs::scene::{Camera, Image};
 use irradia_runs::train::painter::Painter;
-use irradia_runs::{Film, Scene, file_stems, is_film_name, moved_from_run, scene_path, write_image};
+use irradia_runs::{Film, ReadingOptions, Scene, file_stems, is_film_name, moved_from_run, scene_path, write_image};
 use std::path::{Path, PathBuf};
 
 #[derive(clap::Args)]
@@ -22,7 +22,7 @@ pub struct Args {
     #[arg(long)]
     pub data: Option<PathBuf>,
     /// Views of the dataset to render
-    #[arg(long, value_enum, default_value_t = Split::Test)]
+    #[arg(long, value_enum, default_value_t = Split::Test, conflicts_with_all = ["orbit", "path"])]
     pub split: Split,
     /// Render this number of frames on a circle around the scene, or back and forth on an arc if only one side was photographed
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=100_000))]
@@ -30,9 +30,9 @@ pub struct Args {
     /// Render a camera path: a file that the viewer or nerfstudio saved, or orbit, spiral or training (through the cameras)
     #[arg(long, value_name = "FILE|orbit|spiral|training")]
     pub path: Option<PathBuf>,
-    /// Number of frames of --path orbit, spiral and training
-    #[arg(long, value_name = "N", default_value_t = 120, value_parser = clap::value_parser!(u32).range(1..=100_000))]
-    pub frames: u32,
+    /// Number of frames of --path orbit, spiral and training; 120 when absent
+    #[arg(long, value_name = "N", conflicts_with_all = ["data", "orbit"], value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    pub frames: Option<u32>,
     /// Frames per second of a film; when absent those of the path, or 30
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=240))]
     pub fps: Option<u32>,
@@ -58,6 +58,9 @@ pub struct Args {
     pub reading: DataArgs,
 }
 
+/// Frames of a path that is not read from a file: four seconds.
+const PATH_FRAMES: u32 = 120;
+
 /// `640x480`
 pub fn parse_size(text: &str) -> Result<(u32, u32), String> {
     text.split_once('x')
@@ -67,6 +70,10 @@ pub fn parse_size(text: &str) -> Result<(u32, u32), String> {
 }
 
 pub fn run(args: &Args) -> Result<()> {
+    if args.data.is_none() && args.reading.options() != ReadingOptions::default() {
+        let message = "--orbit and --path read no photographs: omit the options for reading them; --size sets the size of the frames";
+        return Err(Usage(message.into()).into());
+    }
     use_threads(args.threads)?;
     let mut scene = Scene::read(&args.scene)?;
     warn(&scene.notes);
@@ -100,10 +107,22 @@ fn film(args: &Args, scene: &Scene) -> Result<Option<Film>> {
     if let Some(frames) = args.orbit {
         return Ok(Some(Film::orbit(scene, frames, args.size)));
     }
-    let path = args.path.as_deref();
-    path.map(|path| film_from_path(path, &args.scene, scene, args.frames, args.size))
-        .transpose()
+    let Some(path) = args.path.as_deref() else {
+        return Ok(None);
+    };
+    let is_file = !GENERATED_PATHS.iter().any(|name| path.as_os_str() == *name);
+    if let Some(frames) = args.frames.filter(|_| is_file) {
+        let path = path.display();
+        return Err(Usage(format!(
+            "--frames {frames}: the number of frames of {path} is in the file: omit it"
+        ))
+        .into());
+    }
+    film_from_path(path, &args.scene, scene, args.frames.unwrap_or(PATH_FRAMES), args.size).map(Some)
 }
+
+/// Names of paths that are made around a scene; any other one is that of a file.
+const GENERATED_PATHS: [&str; 3] = ["orbit", "spiral", "training"];
 
 /// The cameras of the path `path` around the scene that was read from `source`: a file, `orbit`, `spiral` or `training`, which have
 /// `frames` frames.
@@ -164,6 +183,10 @@ fn write_frames(args: &Args, scene: &Scene, cameras: Vec<(String, Camera)>) -> R
             args.out.display()
         ))
         .into());
+    }
+    if let Some(fps) = args.fps {
+        let message = format!("--fps {fps}: single frames have no rate: omit it, or name a film with --out");
+        return Err(Usage(message).into());
     }
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot create {}", args.out.display()))?;
     let mut painter = painter(args, scene)?;

@@ -60,6 +60,19 @@ fn paths_that_cannot_be_followed_are_refused_in_one_line() {
         ("render run --path orbit --frames 0 --out x", 2, &["--frames"]),
         ("render run --path orbit --depth --out x.gif", 2, &["depth"]),
         ("render run --orbit 3 --path orbit --out x", 2, &["--path"]),
+        ("render run --orbit 3 --fps 10 --out x", 2, &["--fps 10", "film"]),
+        ("render run --orbit 3 --frames 3 --out x", 2, &["--frames"]),
+        ("render run --orbit 3 --split all --out x", 2, &["--split"]),
+        (
+            "render run --path spiral --max-side 20 --out x",
+            2,
+            &["--path", "--size"],
+        ),
+        (
+            "render run --path path.json --frames 3 --out x",
+            2,
+            &["--frames 3", "path.json"],
+        ),
         (
             "render run --orbit 3 --out folder.gif",
             2,

@@ -258,9 +258,11 @@ impl FromStr for Background {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
+        // The American spelling is read as well.
+        let name = if text == "gray" { "grey" } else { text };
         let named = [Self::White, Self::Black, Self::Grey, Self::Random]
             .into_iter()
-            .find(|background| background.to_string() == text);
+            .find(|background| background.to_string() == name);
         let color = || {
             let is_hex = |digits: &&str| digits.len() == 6 && digits.bytes().all(|byte| byte.is_ascii_hexdigit());
             let digits = text.strip_prefix('#').filter(is_hex)?;
@@ -341,6 +343,7 @@ mod tests {
             assert_eq!(json, format!("\"{text}\""));
             assert_eq!(serde_json::from_str::<Background>(&json).unwrap(), background);
         }
+        assert_eq!("gray".parse(), Ok(Background::Grey));
         for text in ["pink", "#fff", "#+12345", "#0c0b0é", ""] {
             assert!(text.parse::<Background>().is_err(), "{text}");
         }

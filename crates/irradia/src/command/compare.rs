@@ -552,24 +552,24 @@ fn conditions(args: &Args) -> Vec<String> {
         (None, Some(seconds)) => format!("{seconds} s of training"),
         (None, None) => "whole recipes".into(),
     };
-    if let Some(protocol) = args.protocol {
-        let seeds = format!("{} seed{}", args.seeds, if args.seeds == 1 { "" } else { "s" });
-        return vec![length, format!("protocol {protocol}"), seeds];
-    }
-    let reading = args.reading.reading();
-    let size = match reading.max_side {
-        Some(side) => Some(format!("images of at most {side} px")),
-        None if reading.downscale > 1.0 => Some(format!("images downscaled by {}", reading.downscale)),
-        None => None,
-    };
-    let background = args.background.map(|b| format!("background {b}"));
-    let holdout = reading.holdout.map(|holdout| format!("held out: {holdout}"));
     let seeds = format!("{} seed{}", args.seeds, if args.seeds == 1 { "" } else { "s" });
     let splats = args.max_splats.map(|n| format!("at most {n} splats"));
-    [Some(length), size, holdout, background, splats, Some(seeds)]
-        .into_iter()
-        .flatten()
-        .collect()
+    let how = match args.protocol {
+        Some(protocol) => [Some(format!("protocol {protocol}")), None, None],
+        None => {
+            let reading = args.reading.reading();
+            let size = match reading.max_side {
+                Some(side) => Some(format!("images of at most {side} px")),
+                None if reading.downscale > 1.0 => Some(format!("images downscaled by {}", reading.downscale)),
+                None => None,
+            };
+            let background = args.background.map(|b| format!("background {b}"));
+            let holdout = reading.holdout.map(|holdout| format!("held out: {holdout}"));
+            [size, holdout, background]
+        }
+    };
+    let conditions = iter::once(Some(length)).chain(how).chain([splats, Some(seeds)]);
+    conditions.flatten().collect()
 }
 
 fn write(args: &Args, comparison: &Comparison) -> Result<()> {
@@ -588,6 +588,26 @@ fn write(args: &Args, comparison: &Comparison) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use clap::Parser;
+
+    #[derive(Parser)]
+    struct Cli {
+        #[command(flatten)]
+        args: Args,
+    }
+
+    #[test]
+    fn a_limit_of_splats_is_among_the_conditions_under_a_protocol_too() {
+        let of = |line: &str| conditions(&Cli::parse_from(line.split(' ')).args).join(", ");
+        let line = "compare chair --recipes fast --out x --seeds 1 --steps 9 --max-splats 500";
+        let protocol = of(&format!("{line} --protocol blender"));
+        assert_eq!(protocol, "9 steps, protocol blender, at most 500 splats, 1 seed");
+        let free = of(&format!("{line} --max-side 64 --holdout 5 --background white"));
+        assert_eq!(
+            free,
+            "9 steps, images of at most 64 px, held out: 5, background white, at most 500 splats, 1 seed"
+        );
+    }
 
     #[test]
     fn folder_names_are_safe_and_distinct() {

@@ -13,6 +13,7 @@ use irradia_scene::GaussianCloud;
 use irradia_splat::Splats;
 use irradia_train::checkpoint::{splats_of, with_splats};
 use std::fs;
+use std::io::ErrorKind;
 use std::iter;
 use std::path::{Path, PathBuf};
 
@@ -192,12 +193,15 @@ impl Editing {
             return refused("nothing would be left of the run: name an output with -o".to_owned());
         }
         let _lock = FolderLock::acquire(folder.path())?;
-        let mut list = match fs::read_to_string(folder.file(EDITS)) {
+        let path = folder.file(EDITS);
+        let mut list = match fs::read_to_string(&path) {
             Ok(text) => EditList::parse(&text).map_err(|error| RunError::Damaged {
-                path: folder.file(EDITS),
+                path,
                 reason: error.to_string(),
             })?,
-            Err(_) => EditList::default(),
+            Err(error) if error.kind() == ErrorKind::NotFound => EditList::default(),
+            // Otherwise the list of all earlier edits would be replaced.
+            Err(error) => return Err(RunError::io("read", &path)(error)),
         };
         list.edits.extend(self.list.edits.iter().cloned());
         let splits = self.split_files(&self.path)?;

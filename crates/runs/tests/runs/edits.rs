@@ -181,6 +181,17 @@ fn a_run_edited_in_place_resumes_with_the_edited_splats() {
     let left = read_splats(&path.join("scene.ply")).unwrap().len();
     let listed = EditList::parse(&fs::read_to_string(path.join(EDITS)).unwrap()).unwrap();
     assert_eq!(listed.edits.len(), 4);
+    // A list that cannot be read is not replaced, and neither is the scene.
+    let [list, scene] = [EDITS, "scene.ply"].map(|name| fs::read(path.join(name)).expect("a file"));
+    fs::write(path.join(EDITS), b"\xff").unwrap();
+    let error = edited(&path, &["opacity factor=0.9 all"])
+        .write_in_place()
+        .expect_err("unreadable")
+        .to_string();
+    assert!(error.contains(EDITS), "{error}");
+    assert_eq!(fs::read(path.join(EDITS)).unwrap(), b"\xff");
+    assert!(fs::read(path.join("scene.ply")).unwrap() == scene);
+    fs::write(path.join(EDITS), list).unwrap();
 
     let request = TrainInput::of_run(&path).unwrap().check().unwrap();
     let mut run = Run::resume_on(request, dataset()).expect("resumes");

@@ -16,7 +16,9 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 /// File extensions of films.
-const FILM_EXTENSIONS: [&str; 8] = ["mp4", "mov", "m4v", "mkv", "webm", "avi", "mpg", "mpeg"];
+const FILM_EXTENSIONS: [&str; 12] = [
+    "mp4", "mov", "m4v", "mkv", "webm", "avi", "mpg", "mpeg", "mts", "m2ts", "3gp", "wmv",
+];
 /// Minimum and maximum number of frames chosen from all films together, unless they have fewer.
 const FRAME_COUNT_RANGE: [usize; 2] = [100, 300];
 /// Motion between chosen frames, in frame widths: two thirds of a frame or more stay in view for several frames.

@@ -6,7 +6,7 @@ use crate::terminal::{note, print_line};
 use anyhow::{Context, Result};
 use clap::builder::RangedU64ValueParser;
 use indicatif::{ProgressBar, ProgressStyle};
-use irradia_runs::formats::DatasetFormat;
+use irradia_runs::formats::{DatasetFormat, write_atomic};
 use irradia_runs::scene::Dataset;
 use irradia_runs::{
     Finding, KnownDistance, MIN_POSED_FRACTION, Mapper, POSED_FOLDER, PoseInput, PoseProgress, PoseReport, TrainInput,
@@ -180,8 +180,8 @@ pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses, anywa
     input.reading.holdout = held_out.is_empty().then(|| "0".to_owned());
     if !held_out.is_empty() {
         let list = input.data.join(SPLIT_FILE);
-        std::fs::write(&list, held_out.join("\n") + "\n")
-            .with_context(|| format!("cannot write {}", list.display()))?;
+        let names = held_out.join("\n") + "\n";
+        write_atomic(&list, |out| out.write_all(names.as_bytes()))?;
     }
     Ok(())
 }

@@ -65,7 +65,7 @@ pub enum RunError {
     },
     /// A folder contains no run.
     #[error(
-        "{0} holds no run to resume: cannot read {0}/run.json: {source}; if the run was stopped before training began, repeat the \
+        "{0} holds no run: cannot read {0}/run.json: {source}; if the run was stopped before training began, repeat the \
          command that began it",
         path.display()
     )]

@@ -14,8 +14,9 @@ use std::f32::consts::TAU;
 use std::fs;
 use std::path::Path;
 
-/// Maximum number of frames of a path.
+/// Maximum number of frames of a path, and the error beyond it.
 const MAX_FRAMES: usize = 100_000;
+const TOO_MANY_FRAMES: &str = "it has more than 100,000 frames";
 /// The mean position of the training cameras counts as inside the scene if it is closer to the centre than this fraction of their
 /// distance; that of half a ring is at 0.64.
 const INSIDE_FRACTION: f32 = 0.5;
@@ -84,8 +85,8 @@ pub struct Film {
 }
 
 impl Film {
-    /// Reads a path saved by the viewer, or a `camera_path.json` of nerfstudio. Both are in the coordinates of the photographs, which
-    /// `world_from_photographs` maps to the scene's world, also if the whole scene was moved
+    /// Reads a path saved by the viewer, or a `camera_path.json` of nerfstudio. Both are in the coordinates of the photographs, provided that
+    /// nerfstudio kept these. `world_from_photographs` maps them to the scene's world, also if the whole scene was moved
     /// ([`moved_from_run`](crate::moved_from_run)). Frames have `width` x `height` pixels.
     ///
     /// # Errors
@@ -104,13 +105,17 @@ impl Film {
             serde_json::from_str(&text).map_err(|error| wrong(&format!("not a camera path: {error}")))?;
         if value.get("camera_path").is_some() {
             let file: Nerfstudio = serde_json::from_value(value).map_err(|error| wrong(&error.to_string()))?;
+            if file.camera_path.is_empty() {
+                return Err(wrong("the camera path has no frames"));
+            }
+            if file.camera_path.len() > MAX_FRAMES {
+                return Err(wrong(TOO_MANY_FRAMES));
+            }
             let cameras: Option<Vec<Camera>> = file
                 .camera_path
                 .iter()
-                .take(MAX_FRAMES)
                 .map(|c| c.camera(world_from_photographs, width, height))
                 .collect();
-            let cameras = cameras.filter(|cameras| !cameras.is_empty());
             return Ok(Self {
                 cameras: cameras.ok_or_else(|| wrong("a camera of the path has no valid pose or field of view"))?,
                 fps: file.fps.filter(|fps| FPS_RANGE.contains(fps)).unwrap_or(30.0),
@@ -292,7 +297,7 @@ impl CameraPath {
             return Err("frames per second must be 0.1 to 240, and closing 0 to 1,000,000 seconds");
         }
         if self.seconds() * self.fps > MAX_FRAMES as f32 {
-            return Err("it has more than 100,000 frames");
+            return Err(TOO_MANY_FRAMES);
         }
         Ok(())
     }
@@ -602,6 +607,7 @@ mod tests {
                 .expect_err(&text)
                 .to_string();
             assert!(!error.contains('\n') && error.contains("path.json"), "{error}");
+            assert_eq!(error.contains("no frames"), text == "{\"camera_path\": []}", "{error}");
         }
     }
 }

@@ -79,8 +79,8 @@ impl Sources {
                     |entry: &PathBuf| DatasetFormat::recognise(entry).is_none() && !photo_files(entry).is_empty();
                 self.subfolders.extend(entries.into_iter().filter(is_capture));
             }
-        } else if depth > 0 {
-            // A folder of datasets is not a capture.
+        } else if depth > 0 && !path.join("run.json").is_file() {
+            // The pictures in the folder of a run are its results, and a folder of datasets is not a capture.
             if !entries.iter().any(|entry| DatasetFormat::recognise(entry).is_some()) {
                 for folder in &entries {
                     self.add(folder, out, depth - 1)?;
@@ -344,6 +344,8 @@ mod tests {
         photo("days/monday/1.png");
         photo("days/tuesday/morning/1.png");
         photo("days/masks/1.png");
+        photo("days/run/eval/1.truth.png");
+        fs::write(root.path().join("days/run/run.json"), "{}").unwrap();
         fs::write(root.path().join("days/walk.mp4"), "a film by its name").unwrap();
         let mut sources = Sources::default();
         let days = root.path().join("days");
@@ -354,7 +356,7 @@ mod tests {
         );
         assert_eq!(sources.found_films, [days.join("walk.mp4")]);
         assert!(sources.films.is_empty() && sources.live.is_empty());
-        assert!(is_capture(&days) && is_capture(&days.join("walk.mp4")));
+        assert!(is_capture(&days) && is_capture(&days.join("walk.mp4")) && !is_capture(&days.join("run")));
         // One of several folders has poses: the others do not form one capture with it.
         photo("sets/posed/images/1.png");
         fs::write(root.path().join("sets/posed/transforms.json"), "{}").unwrap();

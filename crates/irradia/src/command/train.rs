@@ -12,6 +12,7 @@ use crate::terminal::{note, one_line, print_line};
 use anyhow::{Result, anyhow, ensure};
 use clap::builder::RangedU64ValueParser;
 use irradia_compute::DeviceChoice;
+use irradia_runs::formats::DatasetFormat;
 use irradia_runs::scene::Dataset;
 use irradia_runs::{
     Background, DEFAULT_RECIPE, Finished, NOT_MEASURED, PoseCheck, PoseSource, Reading, Run, RunError, RunFolder,
@@ -160,6 +161,7 @@ pub fn run(args: &Args) -> Result<()> {
         (None, Some(run)) => begin(replay(run, args)?, args.viewer()),
         (None, None) => {
             let mut input = input(args)?;
+            refuse_run(&input.data)?;
             if let Some(from) = &args.from {
                 let (request, dataset) = with_poses_of(from, input, args.poses)?;
                 RunFolder::check_free(&request.input().out, request.input().overwrite)?;
@@ -180,6 +182,16 @@ pub fn run(args: &Args) -> Result<()> {
             begin_on(request, dataset, args.viewer())
         }
     }
+}
+
+/// Refuses the folder of a run as data, unless it holds a dataset or photographs as well.
+fn refuse_run(data: &Path) -> Result<()> {
+    if !data.join("run.json").is_file() || DatasetFormat::recognise(data).is_some() || is_unposed(data) {
+        return Ok(());
+    }
+    let run = data.display();
+    let message = format!("{run} is a run: resume it with irradia train --resume {run}, or name the data to train on");
+    Err(Usage(message).into())
 }
 
 /// Whether poses are found first, since the data are photographs or films without any. A requested layout says that there are some.

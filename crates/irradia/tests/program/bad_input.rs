@@ -14,7 +14,7 @@ fn data_refused(folder: &Path, words: &[&str]) {
 #[test]
 fn command_line_mistakes_exit_with_2_and_change_nothing() {
     let folder = with_run();
-    let cases: [(&str, &[&str]); 24] = [
+    let cases: [(&str, &[&str]); 25] = [
         ("train", &["<DATA>"]),
         ("train data", &["--out"]),
         (
@@ -22,6 +22,7 @@ fn command_line_mistakes_exit_with_2_and_change_nothing() {
             &["run", "already holds a run", "--overwrite", "--resume"],
         ),
         ("train data --out run/scene.ply", &["run/scene.ply", "is a file"]),
+        ("train run --out x", &["run is a run", "--resume run"]),
         ("train data --out x --recipe clasic", &["`clasic`", "classic"]),
         ("train data --out x --recipe none.toml", &["none.toml"]),
         (

@@ -111,6 +111,16 @@ pub fn pose_first(input: &mut TrainInput, poses: Poses, anyway: bool) -> Result<
         "{} has no poses: finding them first",
         input.data.display()
     ));
+    let absolute = std::path::absolute(&input.data).unwrap_or_else(|_| input.data.clone());
+    if let Some(dataset) = absolute
+        .parent()
+        .filter(|folder| DatasetFormat::recognise(folder).is_some())
+    {
+        let dataset = dataset.display();
+        note(format_args!(
+            "warning: {dataset} is a dataset with poses: name it instead to use them"
+        ));
+    }
     let report = pose_into_run(input, poses, None)?;
     let posed = &input.data;
     if report.fraction() < MIN_POSED_FRACTION && !anyway {

@@ -47,9 +47,9 @@ enum Command {
     /// Write a scene as one HTML page that opens from disk in any browser
     Share(command::share::Args),
     /// Describe a scene, a run or a dataset
-    Info(command::files::InfoArgs),
+    Info(command::info::Args),
     /// Convert a scene to another file format, given by the extension of its name, and report the loss
-    Convert(command::convert::ConvertArgs),
+    Convert(command::convert::Args),
     /// Make a scene small: fewer splats, trained to replace the others and to lose little in the file format
     Compact(command::compact::Args),
     /// Edit a scene: select, delete, move, recolour, remove floaters, merge, ..
@@ -85,8 +85,8 @@ fn main() -> ExitCode {
         Command::Render(args) => command::render::run(&args),
         Command::View(args) => command::view::run(&args),
         Command::Share(args) => command::share::run(&args),
-        Command::Info(args) => command::files::info(&args),
-        Command::Convert(args) => command::convert::convert(&args),
+        Command::Info(args) => command::info::run(&args),
+        Command::Convert(args) => command::convert::run(&args),
         Command::Compact(args) => command::compact::run(&args),
         Command::Edit(args) => command::edit::run(&args),
         Command::Devices => command::devices::run(),

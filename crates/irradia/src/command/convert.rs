@@ -5,11 +5,11 @@ use crate::Usage;
 use crate::terminal::print_line;
 use anyhow::Result;
 use irradia_runs::formats::{Quality, SpzVersion, WriteOptions};
-use irradia_runs::{Conversion, Level, convert as convert_scene, level_file, write_levels};
+use irradia_runs::{Conversion, Level, convert, level_file, write_levels};
 use std::path::PathBuf;
 
 #[derive(clap::Args)]
-pub struct ConvertArgs {
+pub struct Args {
     /// The scene to read: a splat file of any format, a folder of SOG images, or a run
     pub input: PathBuf,
     /// The file to write; its name selects the format: .ply, .compressed.ply, .points.ply, .spz, .splat, .ksplat, .sog, meta.json,
@@ -51,7 +51,7 @@ impl From<QualityArg> for Quality {
     }
 }
 
-pub fn convert(args: &ConvertArgs) -> Result<()> {
+pub fn run(args: &Args) -> Result<()> {
     let extension = args.output.extension().unwrap_or_default().to_ascii_lowercase();
     if extension == "html" || extension == "htm" {
         if args.lod {
@@ -71,7 +71,7 @@ pub fn convert(args: &ConvertArgs) -> Result<()> {
         },
         sog: None,
     };
-    let conversion = convert_scene(&args.input, &args.output, &options, !args.no_compare)?;
+    let conversion = convert(&args.input, &args.output, &options, !args.no_compare)?;
     print_line(format_args!(
         "{}: {} splats{}",
         args.output.display(),

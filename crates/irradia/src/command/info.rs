@@ -6,11 +6,11 @@ use irradia_runs::describe;
 use std::path::PathBuf;
 
 #[derive(clap::Args)]
-pub struct InfoArgs {
+pub struct Args {
     /// A splat file, a field, a run, a point cloud or a dataset folder
     pub path: PathBuf,
 }
 
-pub fn info(args: &InfoArgs) -> Result<()> {
+pub fn run(args: &Args) -> Result<()> {
     print_line(describe(&args.path)?)
 }

@@ -4,9 +4,12 @@ use super::{note_lines, share, size_line};
 use crate::Usage;
 use crate::terminal::print_line;
 use anyhow::Result;
-use irradia_runs::formats::{Quality, SpzVersion, WriteOptions};
+use irradia_runs::formats::{Quality, SplatFormat, SpzVersion, WriteOptions};
 use irradia_runs::{Conversion, Level, convert, level_file, write_levels};
 use std::path::PathBuf;
+
+/// The version that most programs read.
+const DEFAULT_SPZ_VERSION: u8 = 3;
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -19,7 +22,7 @@ pub struct Args {
     #[arg(long, value_enum, default_value_t = QualityArg::Normal)]
     pub quality: QualityArg,
     /// Version of .spz files
-    #[arg(long, value_name = "3|4", default_value_t = 3, value_parser = clap::value_parser!(u8).range(3..=4))]
+    #[arg(long, value_name = "3|4", default_value_t = DEFAULT_SPZ_VERSION, value_parser = clap::value_parser!(u8).range(3..=4))]
     pub spz_version: u8,
     /// Also write levels of detail beside the output, such as scene.lod1.sog: a half, a quarter and an eighth of the splats, merged so that
     /// they look the same from afar
@@ -57,7 +60,22 @@ pub fn run(args: &Args) -> Result<()> {
         if args.lod {
             return Err(Usage("--lod: a page holds no levels of detail".into()).into());
         }
+        if args.quality != QualityArg::Normal {
+            return Err(Usage(
+                "--quality: the splats of a page have a single precision; irradia share --max limits its size".into(),
+            )
+            .into());
+        }
         return share::run(&share::Args::of(&args.input, &args.output));
+    }
+    let format = SplatFormat::of(&args.output)?;
+    if args.spz_version != DEFAULT_SPZ_VERSION && format != SplatFormat::Spz {
+        let version = args.spz_version;
+        let message = format!(
+            "--spz-version {version}: only .spz files are of a chosen version; the output is a {} file",
+            format.suffix()
+        );
+        return Err(Usage(message).into());
     }
     if args.lod {
         // A format without levels is reported before anything is written.

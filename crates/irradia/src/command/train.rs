@@ -155,6 +155,10 @@ pub fn parse_seconds(text: &str) -> Result<f64, String> {
 }
 
 pub fn run(args: &Args) -> Result<()> {
+    if args.viewer().is_none() && args.listen.names_an_address() {
+        let message = "--host and --port are those of the page that --view serves: add --view, or omit them";
+        return Err(Usage(message.into()).into());
+    }
     use_threads(args.threads)?;
     match (&args.resume, &args.replay) {
         (Some(run), _) => resume(run, args),

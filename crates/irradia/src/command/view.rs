@@ -25,11 +25,14 @@ pub struct Args {
     pub reading: DataArgs,
 }
 
+/// This machine alone.
+const DEFAULT_HOST: &str = "127.0.0.1";
+
 /// Where the page is served.
 #[derive(Clone, Debug, clap::Args)]
 pub struct ListenArgs {
     /// Address to serve the page on, such as 0.0.0.0 for other machines, which then need the token of the printed address
-    #[arg(long, default_value = "127.0.0.1")]
+    #[arg(long, default_value = DEFAULT_HOST)]
     pub host: String,
     /// Port of the page; if it is taken, the next free one
     #[arg(long, default_value_t = DEFAULT_PORT)]
@@ -40,6 +43,11 @@ pub struct ListenArgs {
 }
 
 impl ListenArgs {
+    /// Whether a host or port other than the default is requested.
+    pub fn names_an_address(&self) -> bool {
+        self.host != DEFAULT_HOST || self.port != DEFAULT_PORT
+    }
+
     /// Serves `subject`, and prints the address.
     fn start(&self, subject: Subject) -> Result<Viewer> {
         warn(&subject.warnings);

@@ -14,7 +14,7 @@ fn data_refused(folder: &Path, words: &[&str]) {
 #[test]
 fn command_line_mistakes_exit_with_2_and_change_nothing() {
     let folder = with_run();
-    let cases: [(&str, &[&str]); 25] = [
+    let cases: [(&str, &[&str]); 28] = [
         ("train", &["<DATA>"]),
         ("train data", &["--out"]),
         (
@@ -55,6 +55,12 @@ fn command_line_mistakes_exit_with_2_and_change_nothing() {
             &["x.xyz", ".ply", ".spz", ".ksplat", "meta.json"],
         ),
         ("convert run/scene.ply x.spz --spz-version 2", &["--spz-version"]),
+        ("convert run/scene.ply x --spz-version 4", &["known extensions"]),
+        (
+            "convert run/scene.ply x.sog --spz-version 4",
+            &["--spz-version 4", ".sog"],
+        ),
+        ("train data --out x --port 9999", &["--port", "add --view"]),
         ("render run --out x", &["--data", "--orbit"]),
         ("render run --orbit 0 --out x", &["--orbit"]),
         ("synth x --views 1", &["1 views"]),

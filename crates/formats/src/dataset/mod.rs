@@ -49,7 +49,7 @@ use std::str::FromStr;
 /// The layouts of datasets.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum DatasetFormat {
-    /// `cameras`, `images` and `points3D` as `.bin` or `.txt` in `sparse/N`, `sparse` or the folder itself.
+    /// `cameras`, `images` and `points3D` as `.bin` or `.txt` in `sparse/N`, `sparse`, the folder itself or `colmap/sparse/N`.
     Colmap,
     /// nerfstudio's and instant-ngp's `transforms.json`.
     Nerfstudio,
@@ -115,7 +115,7 @@ impl DatasetFormat {
 
     fn expected_files(self) -> &'static str {
         match self {
-            Self::Colmap => "{cameras,images}.{bin,txt} in sparse/0, sparse or the folder (COLMAP)",
+            Self::Colmap => "{cameras,images}.{bin,txt} in sparse/0, sparse, the folder or colmap/sparse/0 (COLMAP)",
             Self::Nerfstudio => "transforms.json (nerfstudio, instant-ngp)",
             Self::Blender => "transforms_train.json (Blender)",
             Self::Llff => "poses_bounds.npy (LLFF)",

@@ -8,7 +8,7 @@ mod write;
 use super::declared::{
     DeclaredCamera, DeclaredDataset, DeclaredPoints, DeclaredPose, DeclaredView, Focal, lens_or_pinhole,
 };
-use super::files::{ImageFolder, choose_image_folder, find_image};
+use super::files::{ImageFolder, choose_image_folder, find_image, relative_name};
 use super::sibling_folder::SiblingFolder;
 use crate::error::read_and_parse;
 use crate::{FormatError, Malformed};
@@ -84,6 +84,8 @@ const CAMERA_MODELS: [(&str, usize); 18] = [
 
 /// Maximum number of models of one folder that are considered.
 const MAX_MODELS: usize = 1000;
+/// Folders with a subfolder per model: COLMAP's own, and that of nerfstudio's layout of COLMAP's models.
+const MODELS_FOLDERS: [&str; 2] = ["sparse", "colmap/sparse"];
 
 /// The folder of a model and its format.
 pub(super) struct ModelFiles {
@@ -102,16 +104,20 @@ fn model_in(folder: &Path) -> Option<ModelFiles> {
     })
 }
 
-/// The complete models of `sparse/0`, `sparse/1`, ..: COLMAP writes one for each part of a scene that it cannot connect.
+/// The complete models of `sparse/0`, `sparse/1`, .. in the first of [`MODELS_FOLDERS`] that has some: COLMAP writes one for each part of a
+/// scene that it cannot connect.
 fn numbered_models(root: &Path) -> Vec<ModelFiles> {
-    (0..MAX_MODELS)
-        .map_while(|i| model_in(&root.join(format!("sparse/{i}"))))
-        .collect()
+    let models_in = |folder: &str| -> Vec<ModelFiles> {
+        let model = |i: usize| model_in(&root.join(folder).join(i.to_string()));
+        (0..MAX_MODELS).map_while(model).collect()
+    };
+    let mut found = MODELS_FOLDERS.into_iter().map(models_in);
+    found.find(|models| !models.is_empty()).unwrap_or_default()
 }
 
-/// The first complete model of `sparse/0`, `sparse` and the folder itself.
+/// The first complete model of `sparse/0`, `sparse`, the folder itself and `colmap/sparse/0`.
 pub(super) fn find_model(root: &Path) -> Option<ModelFiles> {
-    ["sparse/0", "sparse", ""]
+    ["sparse/0", "sparse", "", "colmap/sparse/0"]
         .into_iter()
         .find_map(|below| model_in(&root.join(below)))
 }
@@ -129,8 +135,9 @@ fn largest_model(root: &Path) -> Result<Option<(ModelFiles, Option<String>)>, Fo
     let (max_count, total) = (counts.iter().copied().max().unwrap_or(0), counts.iter().sum::<usize>());
     let largest = counts.iter().position(|count| *count == max_count).unwrap_or(0);
     let warning = format!(
-        "COLMAP made {} models that it could not connect; sparse/{largest} is used, with {max_count} of their {total} photographs",
-        models.len()
+        "COLMAP made {} models that it could not connect; {} is used, with {max_count} of their {total} photographs",
+        models.len(),
+        relative_name(root, &models[largest].folder)
     );
     Ok(Some((models.swap_remove(largest), Some(warning))))
 }
@@ -439,6 +446,43 @@ mod tests {
             camera("RADIAL_FISHEYE", &numbers[..5]).unwrap().lens,
             Lens::fisheye([4.0, 5.0, 0.0, 0.0])
         );
+    }
+
+    #[test]
+    fn models_are_found_in_the_layouts_of_colmap_and_of_nerfstudio() {
+        let image = |i: usize| PosedImage {
+            image: ColmapImage {
+                rotation: [1.0, 0.0, 0.0, 0.0],
+                translation: [0.0; 3],
+                camera_id: 1,
+                name: format!("{i}.jpg"),
+                points: Vec::new(),
+            },
+            keypoints: Vec::new(),
+        };
+        let write = |folder: PathBuf, images: usize| {
+            let images = (0..images).map(image).collect();
+            let model = ColmapModel {
+                images,
+                ..ColmapModel::default()
+            };
+            write_colmap(&folder, &model).unwrap();
+        };
+        for (parent, place) in [("sparse", "sparse/1"), ("colmap/sparse", "colmap/sparse/1")] {
+            let root = tempfile::tempdir().unwrap();
+            assert!(find_model(root.path()).is_none());
+            for (i, images) in [2, 5].into_iter().enumerate() {
+                write(root.path().join(parent).join(i.to_string()), images);
+            }
+            assert!(find_model(root.path()).is_some());
+            let (model, warning) = largest_model(root.path()).unwrap().unwrap();
+            assert_eq!(model.images().unwrap().len(), 5);
+            let warning = warning.unwrap();
+            assert!(
+                warning.contains(&format!("; {place} is used, with 5 of their 7")),
+                "{warning}"
+            );
+        }
     }
 
     #[test]

@@ -133,7 +133,8 @@ pub(super) fn split(
     Ok(indices)
 }
 
-/// Sets the split of views without one from lists beside the dataset. Returns a warning when a list matches nothing.
+/// Sets the split of views without one from lists beside the dataset. Returns a warning when a list matches nothing, or has names that match
+/// nothing.
 fn apply_lists(root: &Path, names: &[String], splits: &mut [Option<Split>]) -> Option<String> {
     if splits.iter().any(Option::is_some) {
         return None;
@@ -164,7 +165,9 @@ fn apply_lists(root: &Path, names: &[String], splits: &mut [Option<Split>]) -> O
             _ => Split::Unlisted,
         });
     }
-    None
+    let missing = [&test, &train].into_iter().flatten();
+    let missing: Vec<String> = missing.filter_map(|list| list.missing_warning(names)).collect();
+    (!missing.is_empty()).then(|| missing.join("; "))
 }
 
 /// The dataset's own split; every 8th view is held out if it has none.
@@ -272,6 +275,14 @@ mod tests {
         std::fs::write(root.path().join("test.txt"), "0").unwrap();
         std::fs::write(root.path().join("train.txt"), "1\n3").unwrap();
         assert_eq!(indices_for(Holdout::AsDeclared, root.path()), (vec![1, 3], vec![0]));
+        std::fs::write(root.path().join("test.txt"), "0\nimages/9.png").unwrap();
+        let indices = split(&Holdout::AsDeclared, root.path(), &names(), vec![None; 4]).unwrap();
+        assert_eq!((indices.train, indices.test), (vec![1, 3], vec![0]));
+        let warning = indices.warning.unwrap();
+        assert!(
+            warning.starts_with("1 names in test.txt") && warning.ends_with("such as images/9.png"),
+            "{warning}"
+        );
     }
 
     #[test]

@@ -198,9 +198,15 @@ impl Film {
         }
     }
 
-    /// `frames` cameras on a smooth loop through the training cameras, in the order of their names; `None` if there are none.
-    pub fn training(scene: &Scene, frames: u32, size: Option<(u32, u32)>) -> Option<Self> {
+    /// `frames` cameras on a smooth loop through the training cameras; `None` if there are none. They follow the `names` of their views
+    /// ([`camera_names`](crate::camera_names)), in which numbers count as numbers: `r_2` comes before `r_10`.
+    pub fn training(scene: &Scene, names: &[String], frames: u32, size: Option<(u32, u32)>) -> Option<Self> {
         let cameras = scene.cameras.as_deref().filter(|cameras| !cameras.is_empty())?;
+        let mut order: Vec<usize> = (0..cameras.len()).collect();
+        if names.len() == cameras.len() {
+            order.sort_by_cached_key(|i| natural_key(&names[*i]));
+        }
+        let cameras: Vec<&Camera> = order.into_iter().map(|i| &cameras[i]).collect();
         let key = |(i, camera): (usize, &Camera)| {
             let (k, q) = (&camera.intrinsics, camera.pose.rotation);
             PathKey {
@@ -216,7 +222,7 @@ impl Film {
             loops: true,
             ease: false,
             closing: 1.0,
-            keys: cameras.iter().enumerate().map(key).collect(),
+            keys: cameras.iter().copied().enumerate().map(key).collect(),
         };
         let (width, height) = size.unwrap_or((cameras[0].intrinsics.width, cameras[0].intrinsics.height));
         let at = |i: u32| path.camera(path.seconds() * i as f32 / frames as f32, width, height);
@@ -225,6 +231,19 @@ impl Film {
             fps: path.fps,
         })
     }
+}
+
+/// A key by which names are sorted with their numbers as numbers: text, number of digits and digits, as often as the name has numbers.
+fn natural_key(mut name: &str) -> Vec<(&str, usize, &str)> {
+    let mut parts = Vec::new();
+    while !name.is_empty() {
+        let (text, rest) = name.split_at(name.find(|c: char| c.is_ascii_digit()).unwrap_or(name.len()));
+        let (digits, after) = rest.split_at(rest.find(|c: char| !c.is_ascii_digit()).unwrap_or(rest.len()));
+        let digits = digits.trim_start_matches('0');
+        parts.push((text, digits.len(), digits));
+        name = after;
+    }
+    parts
 }
 
 /// Intrinsics of another size with the same horizontal field of view.
@@ -490,6 +509,56 @@ mod tests {
                 .map(|c| c.pose.position.length())
                 .fold(f32::INFINITY, f32::min);
             assert!(nearest > 0.4, "{part}: {nearest}");
+        }
+    }
+
+    #[test]
+    fn a_path_through_the_training_cameras_counts_numbers_in_their_names() {
+        let mut names = [
+            "a/r_10.png",
+            "b",
+            "a/r_9.png",
+            "a/r_009a.png",
+            "a/r_2.png",
+            "a/r_100.png",
+            "1",
+        ];
+        names.sort_by_cached_key(|name| natural_key(name));
+        let sorted = [
+            "1",
+            "a/r_2.png",
+            "a/r_9.png",
+            "a/r_009a.png",
+            "a/r_10.png",
+            "a/r_100.png",
+            "b",
+        ];
+        assert_eq!(names, sorted);
+
+        let camera = |x: f32| {
+            let pose = Pose {
+                rotation: Quat::IDENTITY,
+                position: Vec3::new(x, 0.0, 0.0),
+            };
+            Camera::new(pose, Intrinsics::from_fov_x(64, 48, 1.0))
+        };
+        let scene = Scene {
+            model: Model::of_splats(Splats::zeros(1, 0)),
+            options: RenderOptions::default(),
+            cameras: Some([0.0, 10.0, 2.0].map(camera).into()),
+            world_from_dataset: Similarity::IDENTITY,
+            notes: Vec::new(),
+        };
+        let names = ["r_0", "r_10", "r_2"].map(str::to_owned);
+        for (names, expected) in [(&names[..], [0.0, 2.0, 10.0]), (&[], [0.0, 10.0, 2.0])] {
+            let film = Film::training(&scene, names, 3, None).expect("there are cameras");
+            for (camera, x) in film.cameras.iter().zip(expected) {
+                assert!(
+                    (camera.pose.position.x - x).abs() < 1e-4,
+                    "{expected:?}: {}",
+                    camera.pose.position
+                );
+            }
         }
     }
 

@@ -9,7 +9,9 @@ use anyhow::{Context, Result};
 use irradia_edit::Transform;
 use irradia_runs::scene::{Camera, Image};
 use irradia_runs::train::painter::Painter;
-use irradia_runs::{Film, ReadingOptions, Scene, file_stems, is_film_name, moved_from_run, scene_path, write_image};
+use irradia_runs::{
+    Film, ReadingOptions, Scene, camera_names, file_stems, is_film_name, moved_from_run, scene_path, write_image,
+};
 use std::path::{Path, PathBuf};
 
 #[derive(clap::Args)]
@@ -137,7 +139,8 @@ pub(super) fn film_from_path(
         Some("orbit") => Film::orbit(scene, frames, size),
         Some("spiral") => Film::spiral(scene, frames, size),
         Some("training") => {
-            let film = Film::training(scene, frames, size);
+            let names = camera_names(&scene_path(source)).unwrap_or_default();
+            let film = Film::training(scene, &names, frames, size);
             film.ok_or_else(|| Usage("--path training: the cameras of this scene are not known".into()))?
         }
         _ => {

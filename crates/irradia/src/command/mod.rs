@@ -120,8 +120,13 @@ impl DataArgs {
 
 /// The dataset `given` with `--data`, else that of the run that contains `scene`.
 pub fn data_for(given: Option<&Path>, scene: &Path) -> Result<PathBuf> {
-    let of_run = || Some(RunFolder::record_containing(scene)?.input.data);
-    given.map(Path::to_owned).or_else(of_run).ok_or_else(|| {
+    if let Some(given) = given {
+        return Ok(given.to_owned());
+    }
+    // A scene that is not there is in no run either.
+    std::fs::metadata(scene).with_context(|| format!("cannot read {}", scene.display()))?;
+    let of_run = RunFolder::record_containing(scene).map(|record| record.input.data);
+    of_run.ok_or_else(|| {
         let scene = scene.display();
         Usage(format!(
             "{scene}: no run contains it, so that its photographs are not known: add --data"

@@ -111,6 +111,7 @@ fn a_folder_without_a_dataset_gets_the_list_of_known_layouts() {
         .refused(1, &["data/train", "transforms.json"]);
     irradia(folder.path(), "train --resume nowhere").refused(1, &["nowhere", "no run"]);
     irradia(folder.path(), "info nowhere.ply").refused(1, &["nowhere.ply"]);
+    irradia(folder.path(), "compact nowhere.ply --out x.sog --target 5MB").refused(1, &["cannot read nowhere.ply"]);
     assert!(!folder.path().join("run").exists());
 }
 

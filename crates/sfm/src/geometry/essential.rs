@@ -297,7 +297,9 @@ pub fn refine_motion(start: Motion, points: &[[DVec2; 2]], threshold: f64, steps
             let (line_b, line_a) = (essential * a, essential.transpose() * b);
             let squared_length = line_b.truncate().length_squared() + line_a.truncate().length_squared();
             let algebraic = b.dot(line_b);
-            if algebraic * algebraic >= limit * squared_length {
+            // Not the reverse comparison: a point that is not a number, where a lens is not invertible, is left out too.
+            let is_inlier = algebraic * algebraic < limit * squared_length;
+            if !is_inlier {
                 continue;
             }
             // The Sampson denominator is held fixed, as in iteratively reweighted least squares.
@@ -426,5 +428,8 @@ mod tests {
         let motion = refine_motion(start, &views.points, 1.0, 6).expect("converges");
         assert!(motion.rotation.angle_between(views.motion.rotation) < 1e-7);
         assert!(motion.translation.angle_between(views.motion.translation) < 1e-7);
+        // A point where a lens is not invertible changes nothing.
+        let with_nan = [&views.points[..], &[[DVec2::NAN, DVec2::ZERO]]].concat();
+        assert_eq!(refine_motion(start, &with_nan, 1.0, 6), Some(motion));
     }
 }

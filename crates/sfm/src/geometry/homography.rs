@@ -54,13 +54,14 @@ pub fn rotation_between(points: impl Iterator<Item = [DVec2; 2]>) -> DMat3 {
 }
 
 /// How many of `points` a rotation explains with errors below `threshold` in the second photograph. The rotation is fitted to all points,
-/// then again to those within each of the distances `coarse_thresholds`.
+/// then again to those within each of the distances `coarse_thresholds`. Points that are not numbers are left out.
 pub fn count_rotation_inliers(points: &[[DVec2; 2]], coarse_thresholds: &[f64], threshold: f64) -> usize {
     let is_inlier = |rotation: &DMat3, [a, b]: &[DVec2; 2], within: f64| {
         let rotated = *rotation * a.extend(1.0);
         rotated.z > 0.0 && (rotated.truncate() / rotated.z - *b).length() < within
     };
-    let mut rotation = rotation_between(points.iter().copied());
+    let finite = points.iter().copied().filter(|p| p.iter().all(|at| at.is_finite()));
+    let mut rotation = rotation_between(finite);
     for within in coarse_thresholds {
         rotation = rotation_between(points.iter().copied().filter(|p| is_inlier(&rotation, p, *within)));
     }
@@ -138,6 +139,8 @@ mod tests {
             let b = turn * a.extend(1.0);
             [a, b.truncate() / b.z]
         });
-        assert!(rotation_between(points).abs_diff_eq(DMat3::from_quat(turn), 1e-12));
+        assert!(rotation_between(points.clone()).abs_diff_eq(DMat3::from_quat(turn), 1e-12));
+        let with_nan: Vec<[DVec2; 2]> = points.chain([[DVec2::NAN, DVec2::ZERO]]).collect();
+        assert_eq!(count_rotation_inliers(&with_nan, &[0.1], 1e-6), 25);
     }
 }

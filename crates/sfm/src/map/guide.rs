@@ -106,15 +106,15 @@ impl PinholePhoto {
     }
 }
 
-/// Features at the pixels at which a camera without distortion would show them.
+/// Features at the pixels at which a camera without distortion would show them; not a number, which matches nothing, where none would.
 pub(super) fn pinhole_features<'a>(features: &'a Features, camera: &DCamera) -> Cow<'a, Features> {
     if camera.lens() == Lens::Pinhole {
         return Cow::Borrowed(features);
     }
     let [fx, fy, cx, cy, ..] = camera.parameters;
     let place = |keypoint: &Keypoint| {
-        // Keypoints that no pinhole camera shows are moved far away from all lines.
-        let at = camera.unproject(keypoint.at()).unwrap_or(DVec2::splat(1e6));
+        // Not far away: the epipolar line of a point at infinity crosses the other photograph.
+        let at = camera.unproject(keypoint.at()).unwrap_or(DVec2::NAN);
         Keypoint {
             x: (at.x * fx + cx) as f32,
             y: (at.y * fy + cy) as f32,
@@ -228,4 +228,35 @@ fn has_consistent_depth(
         let within = range[0] * (1.0 - DEPTH_TOLERANCE)..range[1] * (1.0 + DEPTH_TOLERANCE);
         neighbours.len() >= MIN_NEIGHBOURS && within.contains(&depth)
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::DESCRIPTOR_BYTES;
+
+    #[test]
+    fn keypoints_that_no_pinhole_camera_shows_match_nothing() {
+        let mut camera = DCamera::centered(1000, 750, 600.0);
+        camera.parameters[4] = -0.5;
+        let at = |x: f32, y: f32| Keypoint {
+            x,
+            y,
+            scale: 2.0,
+            angle: 0.0,
+        };
+        let features = Features {
+            keypoints: vec![at(520.0, 395.0), at(990.0, 740.0)],
+            descriptors: vec![[45; DESCRIPTOR_BYTES]; 2],
+            frontal: Vec::new(),
+        };
+        assert!(camera.unproject(features.keypoints[1].at()).is_none());
+        let pinhole = pinhole_features(&features, &camera);
+        // A forward motion: the epipolar line of a point far away on the diagonal is the diagonal, on which the first keypoint is.
+        let inverse = inverse_calibration(&camera);
+        let essential = crate::geometry::essential::cross_matrix(DVec3::Z);
+        let lines = TwoViewGeometry::Fundamental(inverse.transpose() * essential * inverse);
+        let matches = match_guided(&pinhole, &pinhole, &lines, 2.0, &MatchOptions::default());
+        assert_eq!(matches, [[0, 0]]);
+    }
 }

@@ -75,6 +75,13 @@ fn photographs_are_registered_into_a_known_model_that_stays_as_it_is() {
     }
     let focal = model.cameras[1].expect("registered").focal();
     assert!((focal / 870.0 - 1.0).abs() < 0.02, "{focal}");
+    // A camera that is known exactly stays as it is, also without a known pose.
+    for photo in &mut world.photos[20..] {
+        photo.camera = Some(world::CAMERA);
+    }
+    let model = &world.extend(&known).models[0];
+    assert_eq!(model.registered(), 24);
+    assert_eq!(model.cameras[1], Some(world::CAMERA));
 }
 
 #[test]

@@ -255,7 +255,10 @@ pub fn extend(
 ) -> Reconstruction {
     assert_eq!(photos.len(), known.poses.len(), "a pose or none per photograph");
     let pairs = &still::without_still_matches(photos, features, pairs)[..];
-    let held: Vec<_> = known.cameras.iter().map(|camera| camera.map(exact_camera)).collect();
+    // A group without a known pose may have an exact camera nevertheless.
+    let held: Vec<_> = (known.cameras.iter().zip(known_cameras(photos)))
+        .map(|(camera, exact)| camera.map(exact_camera).or(exact))
+        .collect();
     let unverified = Unverified {
         photos,
         features,

@@ -105,7 +105,9 @@ impl<'a> GrowingModel<'a> {
     /// Adopts known poses and cameras, which are held fixed, and triangulates the points that they see.
     pub fn hold(&mut self, known: &KnownGeometry) {
         self.held_poses = known.poses.iter().map(Option::is_some).collect();
-        self.held_cameras = known.cameras.iter().map(Option::is_some).collect();
+        for (held, camera) in self.held_cameras.iter_mut().zip(&known.cameras) {
+            *held |= camera.is_some();
+        }
         self.adopt_poses(&known.poses);
     }
 

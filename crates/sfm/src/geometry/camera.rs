@@ -113,6 +113,20 @@ impl DCamera {
         DVec2::new(fx * d.x + cx, fy * d.y + cy)
     }
 
+    /// Whether the lens shows the point `p` of the plane z = 1: up to the angle at which distances from the centre stop growing. Beyond it,
+    /// [`Self::pixel`] returns to the photograph.
+    pub fn is_shown(&self, p: DVec2) -> bool {
+        if self.fisheye {
+            let theta = p.length().atan();
+            return theta < MAX_FISHEYE_ANGLE_RADIANS && self.fisheye_radius_slope(theta) > 0.0;
+        }
+        // The slope of r (1 + k1 r^2 + k2 r^4) is 1 + 3 k1 r^2 + 5 k2 r^4. The smallest positive root r^2 is 2 / turn.
+        let [.., k1, k2, _, _] = self.parameters;
+        let turn = -3.0 * k1 + (9.0 * k1 * k1 - 20.0 * k2).sqrt();
+        // Without a root, `turn` is not a number.
+        turn.is_nan() || turn * p.length_squared() < 2.0
+    }
+
     /// The distance from the centre, in focal lengths, at which a fisheye shows the angle `theta` from its axis.
     fn fisheye_radius(&self, theta: f64) -> f64 {
         let [.., k1, k2, k3, k4] = self.parameters;
@@ -345,6 +359,13 @@ mod tests {
             "too wide"
         );
         let mut folded = camera;
+        // Its distances from the centre, r (1 - r^2 / 4), grow up to r^2 = 4 / 3.
+        folded.parameters[4..].copy_from_slice(&[-0.25, 0.0, 0.0, 0.0]);
+        for (r, is_shown) in [(0.0, true), (1.15, true), (1.16, false), (2.0, false), (9.0, false)] {
+            assert_eq!(folded.is_shown(DVec2::new(r, 0.0)), is_shown, "{r}");
+            assert!(fisheye.is_shown(DVec2::new(0.0, r)) == (r < 4.0) && camera.is_shown(0.1 * DVec2::Y * r));
+        }
+        assert!(DCamera::centered(10, 10, 5.0).is_shown(DVec2::new(1e9, 0.0)));
         folded.parameters[4] = -2.0;
         assert_eq!(folded.unproject(DVec2::new(5000.0, 239.0)), None);
         assert_eq!(DCamera::centered(10, 10, 5.0).lens(), Lens::Pinhole);

@@ -100,7 +100,8 @@ fn shared_and_expected(
         let [ray_a, ray_b] = [from, to].map(|pose| point.position - pose.position);
         let [near, far] = [ray_a.length().min(ray_b.length()), ray_a.length().max(ray_b.length())];
         let local = to.camera_from_world(point.position);
-        if local.z <= 0.0 || far > MAX_DISTANCE_RATIO * near || ray_a.dot(ray_b) < MIN_RAY_COSINE * near * far {
+        let is_in_view = local.z > 0.0 && camera.is_shown(local.truncate() / local.z);
+        if !is_in_view || far > MAX_DISTANCE_RATIO * near || ray_a.dot(ray_b) < MIN_RAY_COSINE * near * far {
             continue;
         }
         let at = camera.pixel(local);
@@ -112,4 +113,55 @@ fn shared_and_expected(
     }
     (count >= MIN_EXPECTED_POINTS && count as f64 >= MIN_VISIBLE_FRACTION * seen[a].len() as f64)
         .then_some([shared, count])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::camera::DCamera;
+    use crate::geometry::pose::DPose;
+    use crate::map::ModelPoint;
+    use glam::{DQuat, DVec3};
+
+    /// Two photographs from one place, `turned` apart, each of which shows 50 points straight ahead that the other does not show.
+    fn overlaps_of(turned: f64) -> usize {
+        let photo = PhotoInfo {
+            name: String::new(),
+            width: 1000,
+            height: 750,
+            group: 0,
+            focal_prior_px: None,
+            up: None,
+            camera: None,
+            mount: None,
+        };
+        let mut camera = DCamera::centered(1000, 750, 600.0);
+        camera.parameters[4] = -0.25;
+        let poses = [0.0, turned].map(|angle| DPose {
+            rotation: DQuat::from_rotation_y(angle),
+            ..DPose::IDENTITY
+        });
+        let point = |i: usize| {
+            let angle = 0.002 * (i / 2) as f64 - 0.05;
+            ModelPoint {
+                position: poses[i % 2].rotation * DVec3::new(5.0 * angle.sin(), 0.0, 5.0 * angle.cos()),
+                track: vec![(i as u32 % 2, i as u32 / 2)],
+                error: 0.0,
+            }
+        };
+        let model = Model {
+            cameras: vec![Some(camera)],
+            poses: poses.map(Some).to_vec(),
+            points: (0..100).map(point).collect(),
+            focal_held: vec![false],
+        };
+        overlaps(&[photo.clone(), photo], &model).len()
+    }
+
+    #[test]
+    fn points_beyond_the_lens_are_not_expected() {
+        assert_eq!(overlaps_of(0.1), 1);
+        // Where the distortion turns back, their pixels are inside the photograph again.
+        assert_eq!(overlaps_of(1.1), 0);
+    }
 }

@@ -130,9 +130,9 @@ impl ReducedPhoto {
 
     fn sharpness(&self) -> f32 {
         let mut blocks: Vec<[[f64; 2]; 4]> = Vec::new();
-        let last = |side: usize| side.saturating_sub(BLOCK_SIDE + COARSE_STEP);
-        for y in (0..last(self.height)).step_by(BLOCK_SIDE) {
-            for x in (0..last(self.width)).step_by(BLOCK_SIDE) {
+        let starts = |side: usize| (0..(side + 1).saturating_sub(BLOCK_SIDE + COARSE_STEP)).step_by(BLOCK_SIDE);
+        for y in starts(self.height) {
+            for x in starts(self.width) {
                 blocks.push(self.energies(x, y));
             }
         }
@@ -194,5 +194,8 @@ mod tests {
         assert!((seen.brightness - 100.0 / 255.0).abs() < 1e-6);
         assert_eq!(Appearance::measure(0, 0, &[], None), Appearance::default());
         assert_eq!(Appearance::measure(3, 1, &[0, 255, 9], None).white, 1.0 / 3.0);
+        // The smallest photograph with a block: coarse differences are eight times the fine ones, in all directions.
+        let ramp: Vec<u8> = (0..40 * 40).map(|i| (2 * (i % 40) + i / 40) as u8).collect();
+        assert_eq!(Appearance::measure(40, 40, &ramp, None).sharpness, 1.0 / 64.0);
     }
 }

@@ -7,9 +7,9 @@ use irradia_scene::Rng;
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::geometry::pose::DPose;
 use irradia_sfm::map::{
-    Distance, KnownGeometry, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, Reason, Reconstruction, RigMount,
-    add_guided_points, agreement, complete, determines_focal, duplicate_pairs, extend, find_still_region, reconstruct,
-    scale_to_distances, verify,
+    Distance, FocalSource, KnownGeometry, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, Reason, Reconstruction,
+    RigMount, add_guided_points, agreement, complete, determines_focal, duplicate_pairs, extend, find_still_region,
+    reconstruct, scale_to_distances, verify,
 };
 use irradia_sfm::{DESCRIPTOR_BYTES, Features, Keypoint, PairMatches};
 use std::f64::consts::{FRAC_PI_2, PI};
@@ -104,6 +104,8 @@ fn a_model_is_completed_and_another_beside_it_stays() {
     let [before, after] = [&first, &completed].map(|found| &found.models[0]);
     assert!(before.poses[..16] == after.poses[..16] && before.cameras == after.cameras);
     assert!(completed.models[1] == first.models[1]);
+    let source = |found: &Reconstruction| found.cameras[0].source;
+    assert_eq!([&first, &completed].map(source), [FocalSource::Guess; 2]);
     let seen = World {
         poses: world.poses[..16].iter().chain(&world.poses[20..]).copied().collect(),
         ..world

@@ -316,6 +316,10 @@ pub fn complete(
         .left_out
         .retain(|left| others.iter().all(|other| other.poses[left.photo].is_none()));
     completed.models.extend(others);
+    // They were held, but not because they were known.
+    for (camera, before) in completed.cameras.iter_mut().zip(&found.cameras) {
+        camera.source = before.source;
+    }
     Reconstruction {
         zooms: found.zooms.clone(),
         own_focals: found.own_focals,

@@ -62,17 +62,11 @@ pub fn scale_to_distances(model: &mut Model, photos: &[PhotoInfo], distances: &[
     } else {
         0.0
     };
-    let alignment = Alignment {
+    model.align(&Alignment {
         scale,
         rotation: DQuat::IDENTITY,
         translation: DVec3::ZERO,
-    };
-    for pose in model.poses.iter_mut().flatten() {
-        *pose = alignment.pose(pose);
-    }
-    for point in &mut model.points {
-        point.position = alignment.point(point.position);
-    }
+    });
     Some(DistanceFit {
         residual_m: (squares / n).sqrt(),
         scale_error: (variance / (units * units) + scatter / (metres * metres)).sqrt(),

@@ -12,13 +12,7 @@ use irradia_scene::survey;
 /// The model in its final, upright world.
 pub(super) fn finish(growing: &GrowingModel, photos: &[PhotoInfo]) -> Model {
     let mut model = extract_model(growing, photos);
-    let alignment = upright(&model, photos);
-    for pose in model.poses.iter_mut().flatten() {
-        *pose = alignment.pose(pose);
-    }
-    for point in &mut model.points {
-        point.position = alignment.point(point.position);
-    }
+    model.align(&upright(&model, photos));
     model
 }
 

@@ -72,17 +72,11 @@ pub fn scale_to_locations(model: &mut Model, locations: &[Option<DVec3>]) -> Res
     if scale_fit.scale_error.is_nan() || scale_fit.scale_error > MAX_SCALE_ERROR {
         return Err(Some(scale_fit.scale_error));
     }
-    let alignment = Alignment {
+    model.align(&Alignment {
         scale: heading.length(),
         rotation: DQuat::from_rotation_z(heading.y.atan2(heading.x)) * rotation,
         translation: DVec3::ZERO,
-    };
-    for pose in model.poses.iter_mut().flatten() {
-        *pose = alignment.pose(pose);
-    }
-    for point in &mut model.points {
-        point.position = alignment.point(point.position);
-    }
+    });
     Ok(scale_fit)
 }
 

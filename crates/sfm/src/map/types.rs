@@ -1,6 +1,7 @@
 use super::agreement::{agreement, contradictions, strengths};
 use super::focal::FocalSource;
 use super::missing::MIN_MISSING_PAIRS;
+use crate::geometry::align::Alignment;
 use crate::geometry::camera::DCamera;
 use crate::geometry::essential::Motion;
 use crate::geometry::pose::DPose;
@@ -330,6 +331,16 @@ impl Model {
     /// Number of observations of all points.
     pub fn observations(&self) -> usize {
         self.points.iter().map(|point| point.track.len()).sum()
+    }
+
+    /// Moves poses and points to another world.
+    pub(super) fn align(&mut self, alignment: &Alignment) {
+        for pose in self.poses.iter_mut().flatten() {
+            *pose = alignment.pose(pose);
+        }
+        for point in &mut self.points {
+            point.position = alignment.point(point.position);
+        }
     }
 
     /// Mean reprojection error, px.

@@ -5,7 +5,6 @@
 
 use super::{Diagnosis, Evidence, GlobalRotations, average_rotations};
 use crate::Features;
-use crate::geometry::correspondences::sampson_squared;
 use crate::geometry::essential::{Motion, refine_motion};
 use crate::map::{GroupCamera, PhotoInfo, VerifiedPair, agreement, contradictions, normalized_matches, strengths};
 use glam::{DQuat, DVec2};
@@ -92,17 +91,6 @@ impl Consistency {
     }
 }
 
-/// The fraction of the matches that agree with a motion, in front of both cameras.
-fn inlier_fraction(motion: &Motion, points: &[[DVec2; 2]], threshold: f64) -> f64 {
-    let essential = motion.essential();
-    let agrees = |p: &&[DVec2; 2]| {
-        sampson_squared(&essential, **p) < threshold * threshold
-            // Distant points may be triangulated just behind the cameras, so only the rays are tested: both must point the same way.
-            && (motion.rotation * p[0].extend(1.0)).dot(p[1].extend(1.0)) > 0.0
-    };
-    points.iter().filter(agrees).count() as f64 / points.len().max(1) as f64
-}
-
 /// The best motion whose rotation is near `predicted`: the fraction of matches that agree with it, and its rotation if it explains
 /// the pair.
 fn motion_near_prediction(points: &[[DVec2; 2]], predicted: DQuat, seed: u64) -> (f64, Option<DQuat>) {
@@ -122,7 +110,7 @@ fn motion_near_prediction(points: &[[DVec2; 2]], predicted: DQuat, seed: u64) ->
             rotation: predicted,
             translation,
         };
-        let fraction = inlier_fraction(&motion, points, REFINEMENT_THRESHOLDS[1]);
+        let fraction = motion.agreeing_fraction(points, REFINEMENT_THRESHOLDS[1]);
         if best.is_none_or(|(highest, _)| fraction > highest) {
             best = Some((fraction, motion));
         }
@@ -133,11 +121,10 @@ fn motion_near_prediction(points: &[[DVec2; 2]], predicted: DQuat, seed: u64) ->
     for threshold in REFINEMENT_THRESHOLDS {
         motion = refine_motion(motion, points, threshold, 3).unwrap_or(motion);
     }
-    let angle = 2.0 * motion.rotation.dot(predicted).abs().min(1.0).acos();
-    if angle > MAX_DEVIATION_RADIANS {
+    if motion.rotation.angle_between(predicted) > MAX_DEVIATION_RADIANS {
         return (0.0, None);
     }
-    let fraction = inlier_fraction(&motion, points, INLIER_THRESHOLD);
+    let fraction = motion.agreeing_fraction(points, INLIER_THRESHOLD);
     (fraction, (fraction > MIN_INLIER_FRACTION).then_some(motion.rotation))
 }
 

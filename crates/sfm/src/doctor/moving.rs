@@ -8,7 +8,7 @@
 use super::motion::photos_by_pair_count;
 use super::{Diagnosis, Evidence};
 use crate::PairMatches;
-use crate::geometry::correspondences::{Correspondences, sampson_squared};
+use crate::geometry::correspondences::{Correspondences, sampson_squared, transfer_squared};
 use crate::geometry::essential::cross_matrix;
 use crate::geometry::fundamental::Fundamental;
 use crate::geometry::homography::Homography;
@@ -173,10 +173,8 @@ fn fit_plane(pair: &PairMatches, matches: Vec<Match>) -> Option<(Vec<Match>, Vec
         threshold: MAX_INLIER_ERROR_LONG_SIDES,
     };
     let found = estimate(&problem, Vec::new(), ransac_limits(pair, 500))?;
-    let agrees = |m: &Match| {
-        let mapped = found.model * m.1[0].extend(1.0);
-        (mapped.truncate() / mapped.z - m.1[1]).length() < MAX_INLIER_ERROR_LONG_SIDES
-    };
+    let limit = MAX_INLIER_ERROR_LONG_SIDES * MAX_INLIER_ERROR_LONG_SIDES;
+    let agrees = |m: &Match| transfer_squared(&found.model, m.1) < limit;
     let (group, left): (Vec<Match>, Vec<Match>) = matches.into_iter().partition(agrees);
     (group.len() >= MIN_OBJECT_MATCHES).then_some((group, left))
 }

@@ -64,7 +64,7 @@ pub fn average_rotations(photos: usize, pairs: &[VerifiedPair], measured: &[DQua
                 for (other, from_other, weight) in &partners[photo] {
                     let Some(other) = rotations[*other] else { continue };
                     let predicted = *from_other * other;
-                    let error = angle(predicted, own) / scale;
+                    let error = predicted.angle_between(own) / scale;
                     let robust = weight / (1.0 + error * error).powi(2);
                     let vector = DVec4::from_array(predicted.to_array());
                     sum += robust * vector * vector.dot(DVec4::from_array(own.to_array())).signum();
@@ -81,7 +81,7 @@ pub fn average_rotations(photos: usize, pairs: &[VerifiedPair], measured: &[DQua
         .zip(measured)
         .map(|(pair, b_from_a)| {
             let [a, b] = of(pair);
-            angle(*b_from_a * a, b)
+            (*b_from_a * a).angle_between(b)
         })
         .collect();
     GlobalRotations {
@@ -89,10 +89,6 @@ pub fn average_rotations(photos: usize, pairs: &[VerifiedPair], measured: &[DQua
         component,
         disagreement,
     }
-}
-
-fn angle(a: DQuat, b: DQuat) -> f64 {
-    2.0 * a.dot(b).abs().min(1.0).acos()
 }
 
 /// `[pairs]` the weighted fraction, in \[0, 1\], of the loops of three pairs through each pair that close; 0.5 without any loop.
@@ -107,7 +103,7 @@ fn closed_loop_fractions(photos: usize, pairs: &[VerifiedPair], measured: &[DQua
         for (b, ab) in partners {
             for (c, bc) in &pairs_of[*b] {
                 let Some(ac) = pairs_of[a].get(c) else { continue };
-                let closes = angle(measured[*bc] * measured[*ab], measured[*ac]) < MAX_LOOP_ERROR_RADIANS;
+                let closes = (measured[*bc] * measured[*ab]).angle_between(measured[*ac]) < MAX_LOOP_ERROR_RADIANS;
                 for (pair, others) in [(*ab, [*bc, *ac]), (*bc, [*ab, *ac]), (*ac, [*ab, *bc])] {
                     let weight = others.map(|o| pairs[o].matches.len()).into_iter().min().unwrap_or(0) as f64;
                     counts[pair][0] += if closes { weight } else { 0.0 };
@@ -196,7 +192,7 @@ mod tests {
         let first = found.world_from_camera[0].unwrap();
         for (found, truth) in found.world_from_camera.iter().zip(&cameras) {
             let relative = first.inverse() * found.unwrap();
-            assert!(angle(relative, cameras[0].inverse() * *truth) < 0.04);
+            assert!(relative.angle_between(cameras[0].inverse() * *truth) < 0.04);
         }
         assert!(found.disagreement.iter().all(|off| *off < 0.1));
         assert!(found.component.iter().all(|component| *component == found.component[0]));

@@ -40,6 +40,12 @@ impl Correspondences {
         self.cost::<Epipolar>(m, threshold)
     }
 
+    /// `[N]` whether each is an inlier of an epipolar matrix by the Sampson distance.
+    pub fn epipolar_inliers(&self, m: &DMat3, threshold: f64) -> Vec<bool> {
+        let is_inlier = |p: &[DVec2; 2]| sampson_squared(m, *p) < threshold * threshold;
+        self.points.iter().map(is_inlier).collect()
+    }
+
     /// MSAC cost and number of inliers of a homography (`b ~ m a`) by the distance in the second photograph.
     pub fn transfer_cost(&self, m: &DMat3, threshold: f64) -> (f64, usize) {
         self.cost::<Transfer>(m, threshold)

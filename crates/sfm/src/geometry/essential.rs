@@ -30,6 +30,17 @@ impl Motion {
         let det = aa * bb - ab * ab;
         [(ab * bt - bb * at) / det, (aa * bt - ab * at) / det]
     }
+
+    /// The fraction of `points` that agree with the motion: their Sampson distances are below `threshold`, and both rays point the same
+    /// way. Their depths are not tested: distant points may be triangulated just behind the cameras.
+    pub fn agreeing_fraction(&self, points: &[[DVec2; 2]], threshold: f64) -> f64 {
+        let essential = self.essential();
+        let agrees = |p: &&[DVec2; 2]| {
+            sampson_squared(&essential, **p) < threshold * threshold
+                && (self.rotation * p[0].extend(1.0)).dot(p[1].extend(1.0)) > 0.0
+        };
+        points.iter().filter(agrees).count() as f64 / points.len().max(1) as f64
+    }
 }
 
 /// `cross_matrix(t) x = t cross x`.
@@ -332,18 +343,6 @@ pub struct Essential<'a> {
     pub points: &'a Correspondences,
     /// Maximum Sampson distance of an inlier.
     pub threshold: f64,
-}
-
-impl Essential<'_> {
-    /// `[N]` whether each correspondence is within the threshold of a model.
-    pub fn inliers(&self, model: &DMat3) -> Vec<bool> {
-        let limit = self.threshold * self.threshold;
-        self.points
-            .points
-            .iter()
-            .map(|p| sampson_squared(model, *p) < limit)
-            .collect()
-    }
 }
 
 impl Estimator for Essential<'_> {

@@ -53,19 +53,21 @@ pub fn rotation_between(points: impl Iterator<Item = [DVec2; 2]>) -> DMat3 {
     closest_rotation(sum)
 }
 
+/// Whether `rotation` maps the first of two points to the second with an error below `threshold` in the second photograph.
+pub fn rotates(rotation: &DMat3, [a, b]: [DVec2; 2], threshold: f64) -> bool {
+    let rotated = *rotation * a.extend(1.0);
+    rotated.z > 0.0 && (rotated.truncate() / rotated.z - b).length() < threshold
+}
+
 /// How many of `points` a rotation explains with errors below `threshold` in the second photograph. The rotation is fitted to all points,
 /// then again to those within each of the distances `coarse_thresholds`. Points that are not numbers are left out.
 pub fn count_rotation_inliers(points: &[[DVec2; 2]], coarse_thresholds: &[f64], threshold: f64) -> usize {
-    let is_inlier = |rotation: &DMat3, [a, b]: &[DVec2; 2], within: f64| {
-        let rotated = *rotation * a.extend(1.0);
-        rotated.z > 0.0 && (rotated.truncate() / rotated.z - *b).length() < within
-    };
     let finite = points.iter().copied().filter(|p| p.iter().all(|at| at.is_finite()));
     let mut rotation = rotation_between(finite);
     for within in coarse_thresholds {
-        rotation = rotation_between(points.iter().copied().filter(|p| is_inlier(&rotation, p, *within)));
+        rotation = rotation_between(points.iter().copied().filter(|p| rotates(&rotation, *p, *within)));
     }
-    points.iter().filter(|p| is_inlier(&rotation, p, threshold)).count()
+    points.iter().filter(|p| rotates(&rotation, **p, threshold)).count()
 }
 
 /// Estimation of the homography from correspondences.

@@ -3,9 +3,9 @@
 use super::types::{Model, PhotoInfo, VerifiedPair};
 use crate::Features;
 use crate::geometry::camera::DCamera;
-use crate::geometry::correspondences::sampson_squared;
 use crate::geometry::essential::Motion;
-use glam::{DVec2, DVec3};
+use crate::geometry::homography::rotates;
+use glam::{DMat3, DVec2};
 use rayon::prelude::*;
 use std::collections::BTreeSet;
 
@@ -40,23 +40,15 @@ pub fn agreement(
         let rotation = b.rotation.inverse() * a.rotation;
         let baseline = b.camera_from_world(a.position);
         if baseline.length() < MIN_BASELINE {
-            let is_inlier = |[first, second]: &&[DVec2; 2]| {
-                let rotated: DVec3 = rotation * first.extend(1.0);
-                rotated.z > 0.0 && (rotated.truncate() / rotated.z - *second).length() < MAX_INLIER_ERROR_ON_PLANE
-            };
+            let turn = DMat3::from_quat(rotation);
+            let is_inlier = |p: &&[DVec2; 2]| rotates(&turn, **p, MAX_INLIER_ERROR_ON_PLANE);
             return Some(points.iter().filter(is_inlier).count() as f64 / points.len().max(1) as f64);
         }
         let motion = Motion {
             rotation,
             translation: baseline.normalize(),
         };
-        let essential = motion.essential();
-        let agrees = |p: &&[DVec2; 2]| {
-            sampson_squared(&essential, **p) < MAX_INLIER_ERROR_ON_PLANE * MAX_INLIER_ERROR_ON_PLANE
-                // Distant points may be triangulated just behind the cameras, so only the rays are tested: both must point the same way.
-                && (rotation * p[0].extend(1.0)).dot(p[1].extend(1.0)) > 0.0
-        };
-        Some(points.iter().filter(agrees).count() as f64 / points.len().max(1) as f64)
+        Some(motion.agreeing_fraction(&points, MAX_INLIER_ERROR_ON_PLANE))
     };
     pairs.par_iter().map(inlier_fraction).collect()
 }

@@ -5,7 +5,7 @@ use super::focal::{self, FocalSource};
 use super::guide::pinhole_features;
 use super::types::{GroupCamera, MapOptions, PairKind, PhotoInfo, Progress, VerifiedPair};
 use crate::geometry::camera::DCamera;
-use crate::geometry::correspondences::{Correspondences, sampson_squared};
+use crate::geometry::correspondences::Correspondences;
 use crate::geometry::essential::{Essential, Motion, closest_essential, cross_matrix, motion_in_front, refine_motion};
 use crate::geometry::fundamental::Fundamental;
 use crate::geometry::homography::{Homography, count_rotation_inliers};
@@ -184,11 +184,7 @@ fn estimate_fundamental(
         )
         .filter(enough)
     })?;
-    let inliers: Vec<bool> = points
-        .points
-        .iter()
-        .map(|p| sampson_squared(&best.model, *p) < threshold * threshold)
-        .collect();
+    let inliers = points.epipolar_inliers(&best.model, threshold);
     Some(UncalibratedPair {
         pair: index,
         matrix: best.model,
@@ -243,7 +239,7 @@ fn verify_calibrated(
         essential_from(u.matrix, camera_a.focal() / a, camera_b.focal() / b)
     });
     let best = estimate(&problem, first.into_iter().collect(), limits)?;
-    let mut inliers = problem.inliers(&best.model);
+    let mut inliers = all.epipolar_inliers(&best.model, threshold);
     let mut count = inliers.iter().filter(|i| **i).count();
     let better = uncalibrated.filter(|uncalibrated| {
         group.iter().any(|g| g.source != FocalSource::Prior) && uncalibrated.count as f64 > 1.2 * count as f64

@@ -12,7 +12,7 @@ use super::{exact_camera, finish, verify};
 use crate::geometry::camera::DCamera;
 use crate::geometry::essential::Motion;
 use crate::geometry::pose::DPose;
-use crate::matching::{MatchOptions, TwoViewGeometry, match_guided};
+use crate::matching::{MatchOptions, match_guided};
 use crate::{Features, Keypoint};
 use glam::{DMat3, DVec2, DVec3};
 use irradia_scene::Lens;
@@ -159,7 +159,7 @@ fn guided_pair([a, b]: [&PinholePhoto; 2], options: &MatchOptions) -> Option<Ver
         rotation: (b.pose.rotation.inverse() * a.pose.rotation).normalize(),
         translation: b.pose.camera_from_world(a.pose.position).try_normalize()?,
     };
-    let lines = TwoViewGeometry::Fundamental(b.inverse.transpose() * motion.essential() * a.inverse);
+    let lines = b.inverse.transpose() * motion.essential() * a.inverse;
     let mut matches = match_guided(&a.features, &b.features, &lines, MAX_LINE_DISTANCE_PIXELS, options);
     matches.retain(|[i, j]| {
         motion
@@ -255,7 +255,7 @@ mod tests {
         // A forward motion: the epipolar line of a point far away on the diagonal is the diagonal, on which the first keypoint is.
         let inverse = inverse_calibration(&camera);
         let essential = crate::geometry::essential::cross_matrix(DVec3::Z);
-        let lines = TwoViewGeometry::Fundamental(inverse.transpose() * essential * inverse);
+        let lines = inverse.transpose() * essential * inverse;
         let matches = match_guided(&pinhole, &pinhole, &lines, 2.0, &MatchOptions::default());
         assert_eq!(matches, [[0, 0]]);
     }

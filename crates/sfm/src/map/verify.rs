@@ -10,7 +10,7 @@ use crate::geometry::essential::{Essential, Motion, closest_essential, cross_mat
 use crate::geometry::fundamental::Fundamental;
 use crate::geometry::homography::{Homography, count_rotation_inliers};
 use crate::geometry::ransac::{Estimate, Limits, estimate};
-use crate::matching::{MatchOptions, TwoViewGeometry, match_guided};
+use crate::matching::{MatchOptions, match_guided};
 use crate::{Features, PairMatches, median};
 use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
@@ -262,9 +262,8 @@ fn verify_calibrated(
     let mut angle = median_angle(&motion, &kept);
     if options.guided && angle >= MIN_PARALLAX_RADIANS && !(camera_a.fisheye || camera_b.fisheye) {
         let guided_by = |fundamental: DMat3, a: &Features, b: &Features| {
-            let lines = TwoViewGeometry::Fundamental(fundamental);
             let distance = GUIDED_DISTANCE_RATIO * options.max_epipolar_error;
-            match_guided(a, b, &lines, distance, &MatchOptions::default())
+            match_guided(a, b, &fundamental, distance, &MatchOptions::default())
         };
         let guided = match better {
             Some(uncalibrated) => {

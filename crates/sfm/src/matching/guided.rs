@@ -4,37 +4,27 @@ use glam::{DMat3, DVec3};
 use irradia_compute::nearest::Nearest;
 use irradia_compute::simd::{Kernel, Lanes, Mask, Simd};
 
-/// The known geometry of a pair, in pixels at full size.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum TwoViewGeometry {
-    /// `x2^T F x1 = 0`.
-    Fundamental(DMat3),
-    /// `x2 ~ H x1`.
-    Homography(DMat3),
-}
-
-/// Like [`super::match_features`], but only among features that agree with `geometry`: their Sampson distance (Hartley and Zisserman,
-/// eq. 11.9), or for homographies the distance in the second photograph, is at most `threshold` pixels. Both the nearest and the second
-/// nearest neighbour are among these, so repeated structures elsewhere do not make a match ambiguous.
+/// Like [`super::match_features`], but only among features that agree with the fundamental matrix `F` of the pair, `x2^T F x1 = 0` in
+/// pixels at full size: their Sampson distance (Hartley and Zisserman, eq. 11.9) is at most `threshold` pixels. Both the nearest and the
+/// second nearest neighbour are among these, so repeated structures elsewhere do not make a match ambiguous.
 pub fn match_guided(
     a: &Features,
     b: &Features,
-    geometry: &TwoViewGeometry,
+    fundamental: &DMat3,
     threshold: f64,
     options: &MatchOptions,
 ) -> Vec<[u32; 2]> {
-    let columns = KeypointColumns::new(b, geometry, threshold);
+    let columns = KeypointColumns::new(b, fundamental, threshold);
     let none = |photo: &Features| vec![Nearest::NONE; photo.keypoints.len()];
     let mut kinds: Vec<_> = comparable_descriptors(a, b)
         .map(|both| (both, [none(a), none(b)]))
         .collect();
     let mut candidates: Vec<u32> = Vec::new();
     for (i, keypoint) in a.keypoints.iter().enumerate() {
-        let x1 = DVec3::new(keypoint.x.into(), keypoint.y.into(), 1.0);
         candidates.clear();
         options.level.run(FindCandidates {
             columns: &columns,
-            x1,
+            x1: keypoint.at().extend(1.0),
             candidates: &mut candidates,
         });
         for ([a, b], [of_a, of_b]) in &mut kinds {
@@ -57,18 +47,18 @@ fn dot_product(a: &Descriptor, b: &Descriptor) -> u32 {
 
 /// The second photograph's keypoints, in columns padded to whole vectors.
 struct KeypointColumns {
-    geometry: TwoViewGeometry,
+    fundamental: DMat3,
     /// Squared pixels.
     threshold2: f32,
     x: Vec<f32>,
     y: Vec<f32>,
-    /// The squared length of the gradient of `x2^T F x1` with respect to `x1`; 0 for homographies.
+    /// The squared length of the gradient of `x2^T F x1` with respect to `x1`.
     gradient2: Vec<f32>,
     count: usize,
 }
 
 impl KeypointColumns {
-    fn new(b: &Features, geometry: &TwoViewGeometry, threshold: f64) -> Self {
+    fn new(b: &Features, fundamental: &DMat3, threshold: f64) -> Self {
         let count = b.keypoints.len();
         let padded = |value: &dyn Fn(usize) -> f32| -> Vec<f32> {
             let mut column: Vec<f32> = (0..count).map(value).collect();
@@ -76,23 +66,14 @@ impl KeypointColumns {
             column
         };
         // F is defined up to scale.
-        let geometry = match *geometry {
-            TwoViewGeometry::Fundamental(f) => {
-                let largest = f.to_cols_array().iter().fold(0.0f64, |a, b| a.max(b.abs()));
-                TwoViewGeometry::Fundamental(f * (1.0 / largest.max(f64::MIN_POSITIVE)))
-            }
-            other => other,
-        };
-        let gradient2 = |j: usize| match geometry {
-            TwoViewGeometry::Fundamental(f) => {
-                let keypoint = b.keypoints[j];
-                let line = f.transpose() * DVec3::new(keypoint.x.into(), keypoint.y.into(), 1.0);
-                line.truncate().length_squared() as f32
-            }
-            TwoViewGeometry::Homography(_) => 0.0,
+        let largest = fundamental.to_cols_array().iter().fold(0.0f64, |a, b| a.max(b.abs()));
+        let fundamental = *fundamental * (1.0 / largest.max(f64::MIN_POSITIVE));
+        let gradient2 = |j: usize| {
+            let line = fundamental.transpose() * b.keypoints[j].at().extend(1.0);
+            line.truncate().length_squared() as f32
         };
         Self {
-            geometry,
+            fundamental,
             threshold2: (threshold * threshold) as f32,
             x: padded(&|j| b.keypoints[j].x),
             y: padded(&|j| b.keypoints[j].y),
@@ -124,24 +105,15 @@ impl Kernel for FindCandidates<'_> {
         } = self;
         let set = |value: f64| simd.set(value as f32);
         let limit = simd.set(columns.threshold2);
+        // The epipolar line with a unit normal keeps distances small.
+        let line = columns.fundamental * x1;
+        let length2 = line.truncate().length_squared().max(f64::MIN_POSITIVE);
+        let unit = line / length2.sqrt();
         for at in (0..columns.count).step_by(S::LANES) {
             let (x, y) = (simd.load(&columns.x[at..]), simd.load(&columns.y[at..]));
-            let agree = match columns.geometry {
-                TwoViewGeometry::Fundamental(f) => {
-                    // The epipolar line with a unit normal keeps distances small.
-                    let line = f * x1;
-                    let length2 = line.truncate().length_squared().max(f64::MIN_POSITIVE);
-                    let unit = line / length2.sqrt();
-                    let distance = x * set(unit.x) + y * set(unit.y) + set(unit.z);
-                    let weight = simd.load(&columns.gradient2[at..]) * set(1.0 / length2) + simd.splat(1.0);
-                    (distance * distance).le(weight * limit)
-                }
-                TwoViewGeometry::Homography(h) => {
-                    let mapped = h * x1;
-                    let (dx, dy) = (x - set(mapped.x / mapped.z), y - set(mapped.y / mapped.z));
-                    (dx * dx + dy * dy).le(limit)
-                }
-            };
+            let distance = x * set(unit.x) + y * set(unit.y) + set(unit.z);
+            let weight = simd.load(&columns.gradient2[at..]) * set(1.0 / length2) + simd.splat(1.0);
+            let agree = (distance * distance).le(weight * limit);
             let valid = (columns.count - at).min(S::LANES);
             let mut bits = agree.bits() & ((1u32 << valid) - 1);
             while bits != 0 {
@@ -187,28 +159,18 @@ mod tests {
         let options = MatchOptions::default();
         let expected: Vec<[u32; 2]> = (0..40).map(|i| [i, i]).collect();
         assert!(super::super::match_features(&a, &b, &options).is_empty());
-        for geometry in [
-            TwoViewGeometry::Fundamental(sideways * 1e-4),
-            TwoViewGeometry::Homography(DMat3::from_translation(glam::DVec2::new(-30.0, 0.0))),
-        ] {
-            for level in irradia_compute::Level::all() {
-                let options = MatchOptions { level, ..options };
-                assert_eq!(match_guided(&a, &b, &geometry, 2.0, &options), expected);
-            }
-            assert!(match_guided(&a, &b, &geometry, 0.6, &options).is_empty());
+        let fundamental = sideways * 1e-4;
+        for level in irradia_compute::Level::all() {
+            let options = MatchOptions { level, ..options };
+            assert_eq!(match_guided(&a, &b, &fundamental, 2.0, &options), expected);
         }
+        assert!(match_guided(&a, &b, &fundamental, 0.6, &options).is_empty());
     }
 
     #[test]
     fn degenerate_geometry_matches_nothing_and_does_not_panic() {
         let a = repeated(&[[1.0, 2.0], [30.0, 4.0]]);
         let nan = DMat3::from_diagonal(DVec3::splat(f64::NAN));
-        for geometry in [
-            TwoViewGeometry::Homography(DMat3::ZERO),
-            TwoViewGeometry::Homography(nan),
-            TwoViewGeometry::Fundamental(nan),
-        ] {
-            assert!(match_guided(&a, &a, &geometry, 4.0, &MatchOptions::default()).is_empty());
-        }
+        assert!(match_guided(&a, &a, &nan, 4.0, &MatchOptions::default()).is_empty());
     }
 }

@@ -12,7 +12,7 @@ use irradia_compute::nearest::{Nearest, nearest};
 use rayon::prelude::*;
 use std::collections::HashSet;
 
-pub use guided::{TwoViewGeometry, match_guided};
+pub use guided::match_guided;
 pub use pairs::{PairOptions, candidate_pairs};
 
 type Descriptor = [u8; DESCRIPTOR_BYTES];

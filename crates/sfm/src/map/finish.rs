@@ -11,13 +11,13 @@ use irradia_scene::survey;
 
 /// The model in its final, upright world.
 pub(super) fn finish(growing: &GrowingModel, photos: &[PhotoInfo]) -> Model {
-    let mut model = extract_model(growing, photos);
+    let mut model = extract_model(growing);
     model.align(&upright(&model, photos));
     model
 }
 
 /// The model in the world in which it grew.
-pub(super) fn extract_model(growing: &GrowingModel, photos: &[PhotoInfo]) -> Model {
+pub(super) fn extract_model(growing: &GrowingModel) -> Model {
     let mut model = Model {
         cameras: Vec::new(),
         poses: growing.poses.clone(),
@@ -25,11 +25,8 @@ pub(super) fn extract_model(growing: &GrowingModel, photos: &[PhotoInfo]) -> Mod
         focal_held: growing.focal_held.clone(),
     };
     for (group, camera) in growing.cameras.iter().enumerate() {
-        let present = photos
-            .iter()
-            .zip(&growing.poses)
-            .any(|(photo, pose)| photo.group == group && pose.is_some());
-        model.cameras.push(present.then_some(*camera));
+        let is_present = growing.registered_in_group(group) > 0;
+        model.cameras.push(is_present.then_some(*camera));
     }
     for track in growing.triangulated_tracks() {
         let position = growing.points[track].expect("listed");

@@ -56,7 +56,7 @@ pub fn add_guided_points(
     let cameras: verify::Cameras = model.cameras.iter().map(camera).collect();
     let mut growing = GrowingModel::new(photos, &cameras, &tracks, options);
     growing.hold(&KnownGeometry::from(&*model));
-    let found = finish::extract_model(&growing, photos).points;
+    let found = finish::extract_model(&growing).points;
     let (certain, of_two): (Vec<_>, Vec<_>) = found
         .into_iter()
         .partition(|point| point.track.len() >= MIN_CERTAIN_PHOTOS);

@@ -5,6 +5,7 @@
 //! The result depends only on the input, not on clocks, threads or hash order.
 
 mod agreement;
+mod covering;
 mod distance;
 mod finish;
 mod fisheye;
@@ -280,7 +281,7 @@ pub fn extend(
     growing.grow(&vec![false; photos.len()], progress);
     let assigned: Vec<bool> = growing.poses.iter().map(Option::is_some).collect();
     let left_out = finish::left_out(&input, pairs, &assigned, &growing.failures);
-    let model = finish::extract_model(&growing, photos);
+    let model = finish::extract_model(&growing);
     Reconstruction {
         missing: missing_matches(photos, &model),
         models: vec![model],

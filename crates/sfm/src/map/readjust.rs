@@ -1,5 +1,6 @@
 //! Adjusts a finished model once more with other cameras, on some of its observations, to see whether these cameras fit better.
 
+use super::covering::covering;
 use super::types::{Model, PhotoInfo};
 use crate::Features;
 use crate::adjust::{AdjustOptions, AdjustedCamera, Loss, Observation, Problem, View};
@@ -38,7 +39,8 @@ pub(super) fn problem(
         problem.poses.push(model.poses[photo].expect("posed"));
         problem.held_poses.push(false);
     }
-    for point in covering_points(model, photos.len()) {
+    let photos_of = |point: usize| model.points[point].track.iter().map(|(photo, _)| *photo as usize);
+    for point in covering(0..model.points.len(), photos.len(), MIN_PHOTO_OBSERVATIONS, photos_of) {
         let point = &model.points[point];
         for (photo, keypoint) in &point.track {
             problem.observations.push(Observation {
@@ -59,21 +61,3 @@ pub(super) const OPTIONS: AdjustOptions = AdjustOptions {
     iterations: 40,
     tolerance: 3e-4,
 };
-
-/// Indices of points, those with long tracks first, that give each photograph at least [`MIN_PHOTO_OBSERVATIONS`] where possible.
-fn covering_points(model: &Model, photos: usize) -> Vec<usize> {
-    let mut order: Vec<usize> = (0..model.points.len()).collect();
-    order.sort_by_key(|i| std::cmp::Reverse(model.points[*i].track.len()));
-    let mut counts = vec![0usize; photos];
-    order.retain(|i| {
-        let track = &model.points[*i].track;
-        let is_needed = track
-            .iter()
-            .any(|(photo, _)| counts[*photo as usize] < MIN_PHOTO_OBSERVATIONS);
-        if is_needed {
-            track.iter().for_each(|(photo, _)| counts[*photo as usize] += 1);
-        }
-        is_needed
-    });
-    order
-}

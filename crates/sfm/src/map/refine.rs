@@ -1,5 +1,6 @@
 //! Bundle adjustment of a growing model.
 
+use super::covering::covering;
 use super::focal::{FocalSource, are_far_apart};
 use super::model::GrowingModel;
 use super::types::MapOptions;
@@ -44,7 +45,7 @@ impl GrowingModel<'_> {
     pub fn adjust_all(&mut self, extent: Extent) -> AdjustReport {
         let points = self.triangulated_tracks();
         let chosen = if extent == Extent::Growing {
-            self.covering_tracks(&points, MIN_PHOTO_OBSERVATIONS)
+            self.covering_tracks(&points)
         } else {
             points.clone()
         };
@@ -253,23 +254,14 @@ impl GrowingModel<'_> {
         }
     }
 
-    /// A subset of `tracks`, long ones preferred, that gives each photograph at least `min_observations` where possible; ascending.
-    fn covering_tracks(&self, tracks: &[usize], min_observations: usize) -> Vec<usize> {
-        let length = |track: usize| self.tracks.range(track).filter(|o| self.used[*o]).count();
-        let mut order: Vec<(usize, usize)> = tracks.iter().map(|t| (length(*t), *t)).collect();
-        order.sort_by_key(|(length, track)| (std::cmp::Reverse(*length), *track));
-        let mut counts = vec![0usize; self.poses.len()];
-        let mut chosen = Vec::new();
-        for (_, track) in order {
-            let photos = || {
-                let observations = self.tracks.range(track).filter(|o| self.used[*o]);
-                observations.map(|o| self.tracks.observations[o].photo as usize)
-            };
-            if photos().any(|p| counts[p] < min_observations) {
-                photos().for_each(|p| counts[p] += 1);
-                chosen.push(track);
-            }
-        }
+    /// A subset of `tracks`, long ones preferred, that is enough for an adjustment while the model grows; ascending.
+    fn covering_tracks(&self, tracks: &[usize]) -> Vec<usize> {
+        let photos_of = |track: usize| {
+            let observations = self.tracks.range(track).filter(|o| self.used[*o]);
+            observations.map(|o| self.tracks.observations[o].photo as usize)
+        };
+        let tracks = tracks.iter().copied();
+        let mut chosen = covering(tracks, self.poses.len(), MIN_PHOTO_OBSERVATIONS, photos_of);
         chosen.sort_unstable();
         chosen
     }

@@ -5,9 +5,9 @@
 //! slope; per point V = sum B^T B + damping; per point and block W = A^T B or K^T B.
 
 use super::cholesky::{Symmetric, conjugate_gradients};
-use super::{DIRECT_LIMIT, Loss, MIN_DEPTH, Problem, State, View};
+use super::{DIRECT_LIMIT, Loss, MIN_DEPTH, Problem, State, View, ViewState};
 use crate::geometry::camera::PARAMETERS;
-use glam::{DMat3, DVec3};
+use glam::{DMat3, DVec2, DVec3};
 use irradia_compute::simd::{Kernel, Lanes, Level, Simd};
 use rayon::prelude::*;
 
@@ -29,6 +29,55 @@ const EMPTY_ROW: Row = Row {
     b: [[0.0; 3]; 2],
     k: [[0.0; PARAMETERS]; 2],
 };
+
+impl Row {
+    /// The row of a `point` that `view` shows `at` a pixel, and its loss; `None` if the point is behind the camera. `free` has 1 for each
+    /// column of the camera that is adjusted and 0 for the others, and the ratio fy / fx.
+    #[inline(always)]
+    fn new(
+        view: &ViewState,
+        point: DVec3,
+        at: DVec2,
+        loss: Loss,
+        (free, ratio): &([f64; PARAMETERS], f64),
+    ) -> Option<(Self, f64)> {
+        let p = view.rotation * (point - view.position);
+        if p.z <= MIN_DEPTH {
+            return None;
+        }
+        let projection = view.camera.project(p);
+        let r = projection.at - at;
+        let (rho, slope) = loss.evaluate(r.length_squared());
+        let root = slope.sqrt();
+        let mut row = Self {
+            r: (r * root).to_array(),
+            ..EMPTY_ROW
+        };
+        for e in 0..2 {
+            let jacobian = projection.point_jacobian[e] * root;
+            // d camera point / d turn: the cross product turn x p, in the pose's axes; / d point: the rotation.
+            let turn = view.rig_from_camera * p.cross(jacobian);
+            let point = view.rotation.transpose() * jacobian;
+            row.a[e] = [turn.x, turn.y, turn.z, -point.x, -point.y, -point.z];
+            row.b[e] = point.to_array();
+            for c in 0..PARAMETERS {
+                row.k[e][c] = free[c] * root * projection.camera_jacobian[e][c];
+            }
+            row.k[e][0] += free[0] * ratio * root * projection.camera_jacobian[e][1];
+        }
+        Some((row, rho))
+    }
+}
+
+/// Adds `b^T other` of one observation to `to`.
+#[inline(always)]
+fn add_products<const N: usize>(b: &[[f64; 3]; 2], other: &[[f64; N]; 2], to: &mut [[f64; N]; 3]) {
+    for x in 0..3 {
+        for c in 0..N {
+            to[x][c] += b[0][x] * other[0][c] + b[1][x] * other[1][c];
+        }
+    }
+}
 
 /// Smallest and largest damped diagonal (Ceres' bounds).
 const DIAGONAL_BOUNDS: (f64, f64) = (1e-6, 1e32);
@@ -170,40 +219,19 @@ impl Linearization {
                     let here = group_starts[i] as usize..group_starts[i + 1] as usize;
                     for o in problem.starts[i]..problem.starts[i + 1] {
                         let observation = &problem.observations[o as usize];
-                        let view = &views[observation.view as usize];
+                        let view = observation.view as usize;
                         let at = (o - first_row) as usize;
-                        let p = view.rotation * (state.points[i] - view.position);
-                        if p.z <= MIN_DEPTH {
+                        w[at] = [[0.0; POSE_SIZE]; 3];
+                        let camera = &columns[problem.views[view].camera as usize];
+                        let Some((row, rho)) = Row::new(&views[view], state.points[i], observation.at, loss, camera)
+                        else {
                             rows[at] = EMPTY_ROW;
-                            w[at] = [[0.0; POSE_SIZE]; 3];
                             cost = f64::INFINITY;
                             continue;
-                        }
-                        let projection = view.camera.project(p);
-                        let r = projection.at - observation.at;
-                        let (rho, slope) = loss.evaluate(r.length_squared());
+                        };
                         cost += rho;
-                        let root = slope.sqrt();
-                        let row = &mut rows[at];
-                        row.r = (r * root).to_array();
-                        let (mask, ratio) = columns[problem.views[observation.view as usize].camera as usize];
-                        for e in 0..2 {
-                            let jacobian = projection.point_jacobian[e] * root;
-                            // d camera point / d turn: the cross product turn x p, in the pose's axes; / d point: the rotation.
-                            let turn = view.rig_from_camera * p.cross(jacobian);
-                            let point = view.rotation.transpose() * jacobian;
-                            row.a[e] = [turn.x, turn.y, turn.z, -point.x, -point.y, -point.z];
-                            row.b[e] = point.to_array();
-                            for c in 0..PARAMETERS {
-                                row.k[e][c] = mask[c] * root * projection.camera_jacobian[e][c];
-                            }
-                            row.k[e][0] += mask[0] * ratio * root * projection.camera_jacobian[e][1];
-                        }
-                        for x in 0..3 {
-                            for c in 0..POSE_SIZE {
-                                w[at][x][c] = row.b[0][x] * row.a[0][c] + row.b[1][x] * row.a[1][c];
-                            }
-                        }
+                        rows[at] = row;
+                        add_products(&row.b, &row.a, &mut w[at]);
                         let b = row.b.map(DVec3::from_array);
                         for b in b {
                             v.0 += DMat3::from_cols(b * b.x, b * b.y, b * b.z);
@@ -215,12 +243,7 @@ impl Linearization {
                                 .clone()
                                 .find(|g| groups[*g] == block)
                                 .expect("its camera is listed");
-                            let wk = &mut wk[entry - first_group as usize];
-                            for x in 0..3 {
-                                for c in 0..PARAMETERS {
-                                    wk[x][c] += row.b[0][x] * row.k[0][c] + row.b[1][x] * row.k[1][c];
-                                }
-                            }
+                            add_products(&row.b, &row.k, &mut wk[entry - first_group as usize]);
                         }
                     }
                 }

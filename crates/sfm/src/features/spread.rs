@@ -1,3 +1,5 @@
+//! Selection of features that cover the photograph, if there are too many.
+
 /// Cells along the longer side of a photograph.
 const GRID_CELLS: f32 = 16.0;
 /// The fraction of `count` that is distributed evenly among the cells. With all of it distributed evenly, photographs of a street had

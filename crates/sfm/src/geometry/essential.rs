@@ -88,7 +88,7 @@ pub fn motion_in_front<'a>(essential: DMat3, points: impl Iterator<Item = &'a [D
         .expect("four motions")
 }
 
-/// Polynomials of degree 1, 2 and 3 in x, y, z; monomials in the order of [`MONOMIALS`].
+/// Polynomials of degree 1, 2 and 3 in x, y, z; monomials in the orders of [`LINEAR`], [`QUADRATIC`] and [`MONOMIALS`].
 type Linear = [f64; 4];
 type Quadratic = [f64; 10];
 type Cubic = [f64; 20];

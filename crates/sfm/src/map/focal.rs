@@ -15,7 +15,7 @@ pub enum FocalSource {
     Prior,
     /// The pairs: the focal length that fits their matches best.
     Pairs,
-    /// A common value, 1.2 times the long side.
+    /// Neither: a common value, 1.2 times the long side unless another is tried.
     Guess,
 }
 

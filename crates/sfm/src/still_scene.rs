@@ -141,14 +141,15 @@ impl StillScene {
 
     /// Brightness of each channel of a photograph relative to this scene, where the photograph shows it.
     fn channel_gains(&self, color: &[Vec<f32>; 3], labels: &[Label]) -> [f32; 3] {
-        let sum = |values: &[f32]| -> f32 {
+        // In single precision, a sum over a photograph would round each of its last summands to a multiple of 2 or more.
+        let sum = |values: &[f32]| -> f64 {
             let of = values.iter().zip(labels).filter(|v| *v.1 == Label::Still);
-            of.map(|v| v.0).sum()
+            of.map(|v| f64::from(*v.0)).sum()
         };
         [0, 1, 2].map(|c| {
             let here = sum(&color[c]);
             if here > 0.0 {
-                here / sum(&self.color[c]).max(1.0)
+                (here / sum(&self.color[c]).max(1.0)) as f32
             } else {
                 1.0
             }
@@ -432,6 +433,21 @@ mod tests {
         };
         let [behind, disc] = masked(&turntable(20, plain, |i| [0.9, 0.95, 1.0][i % 3]));
         assert!(behind > 0.97 && disc < 0.02, "{behind} {disc}");
+    }
+
+    #[test]
+    fn the_light_of_a_large_photograph_is_exact() {
+        const PIXELS: usize = 1_000_000;
+        let plane = |value: f32| [0; 3].map(|_| vec![value; PIXELS]);
+        let still = StillScene {
+            width: 1000,
+            color: plane(100.0),
+            texture: Vec::new(),
+            support: Vec::new(),
+            constant: Vec::new(),
+        };
+        let gains = still.channel_gains(&plane(101.0), &vec![Label::Still; PIXELS]);
+        assert_eq!(gains, [1.01; 3]);
     }
 
     #[test]

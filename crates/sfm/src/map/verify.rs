@@ -261,20 +261,19 @@ fn verify_calibrated(
     let mut motion = refined(motion_in_front(best.model, kept.iter()).0, &kept);
     let mut angle = median_angle(&motion, &kept);
     if options.guided && angle >= MIN_PARALLAX_RADIANS && !(camera_a.fisheye || camera_b.fisheye) {
-        let guided_by = |fundamental: DMat3, a: &Features, b: &Features| {
-            let distance = GUIDED_DISTANCE_RATIO * options.max_epipolar_error;
-            match_guided(a, b, &fundamental, distance, &MatchOptions::default())
-        };
         let guided = match better {
             Some(uncalibrated) => {
                 let [a, b] = pair.photos.map(|p| to_centered(&photos[p as usize]));
-                guided_by(b.transpose() * uncalibrated.matrix * a, features_a, features_b)
+                let fundamental = b.transpose() * uncalibrated.matrix * a;
+                match_along_lines([features_a, features_b], &fundamental, options)
             }
-            None => guided_by(
-                inverse_calibration(camera_b).transpose() * motion.essential() * inverse_calibration(camera_a),
-                &pinhole_features(features_a, camera_a),
-                &pinhole_features(features_b, camera_b),
-            ),
+            None => {
+                let [a, b] = [camera_a, camera_b].map(inverse_calibration);
+                let [seen_a, seen_b] = [(features_a, camera_a), (features_b, camera_b)]
+                    .map(|(features, camera)| pinhole_features(features, camera));
+                let fundamental = b.transpose() * motion.essential() * a;
+                match_along_lines([&seen_a, &seen_b], &fundamental, options)
+            }
         };
         if guided.len() > matches.len() {
             kept = normalized(&guided);
@@ -295,6 +294,12 @@ fn verify_calibrated(
         motion,
         angle: if kind == PairKind::Rotation { 0.0 } else { angle },
     })
+}
+
+/// The matches of two photographs along the epipolar lines of a fundamental matrix between their pixels.
+fn match_along_lines([a, b]: [&Features; 2], fundamental: &DMat3, options: &MapOptions) -> Vec<[u32; 2]> {
+    let distance = GUIDED_DISTANCE_RATIO * options.max_epipolar_error;
+    match_guided(a, b, fundamental, distance, &MatchOptions::default())
 }
 
 /// Maps homogeneous pixels to the plane z = 1, ignoring distortion.

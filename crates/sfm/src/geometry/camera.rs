@@ -96,7 +96,7 @@ impl DCamera {
     }
 
     /// Pixels per unit of the plane z = 1 at the point `p` of it: of a fisheye in the radial direction, in which it has the fewest; of a
-    /// perspective lens at its centre: its distortion is neglected.
+    /// perspective lens at its centre, since its distortion is neglected.
     pub fn focal_at(&self, p: DVec2) -> f64 {
         if self.fisheye {
             self.focal() * self.fisheye_radius_slope(p.length().atan()) / (1.0 + p.length_squared())

@@ -21,8 +21,8 @@ const MAX_SEED_CANDIDATES: usize = 20 * MAX_SEEDS;
 const MIN_EXPLAINED_FRACTION: f64 = 0.8;
 /// Number of times a photograph is tried before it is given up.
 const MAX_REGISTRATION_ATTEMPTS: usize = 3;
-/// Number of times a photograph is removed before it is given up: many, since photographs of narrow views are removed until the focal length
-/// is found.
+/// Number of times a photograph is removed before it is given up: many, since photographs of narrow views are removed until the focal
+/// length is found.
 const MAX_REMOVALS: usize = 10;
 /// Minimum number of points of a pair of photographs for a seed.
 const MIN_SEED_POINTS: usize = 12;

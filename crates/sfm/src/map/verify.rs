@@ -93,13 +93,18 @@ pub(super) fn verify_with(
     for (camera, given) in cameras.iter_mut().zip(given) {
         *camera = given.unwrap_or(*camera);
     }
+    let has_fisheye = |pair: &PairMatches| {
+        let mut groups = pair.photos.iter().map(|photo| photos[*photo as usize].group);
+        groups.any(|group| cameras[group].camera.fisheye)
+    };
     let verified: Vec<VerifiedPair> = pairs
         .par_iter()
         .zip(&uncalibrated)
         .zip(&known)
         .filter_map(|((pair, uncalibrated), known)| {
-            // Without a common epipolar geometry there is no calibrated one either.
-            if pair.matches.len() < options.min_inliers || (!known && uncalibrated.is_none()) {
+            // Without a common epipolar geometry there is no calibrated one either, except where a fisheye bends the epipolar lines.
+            let has_no_geometry = !known && uncalibrated.is_none() && !has_fisheye(pair);
+            if pair.matches.len() < options.min_inliers || has_no_geometry {
                 return None;
             }
             verify_calibrated(photos, features, pair, uncalibrated.as_ref(), &cameras, options)
@@ -371,6 +376,72 @@ fn median_angle(motion: &Motion, points: &[[DVec2; 2]]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Keypoint;
+    use crate::geometry::pose::DPose;
+    use glam::DQuat;
+    use irradia_scene::Rng;
+
+    /// Two photographs of a room by a fisheye, and the matches of `points` points.
+    fn fisheye_pair(camera: &DCamera, points: usize) -> (Vec<PhotoInfo>, Vec<Features>, PairMatches) {
+        let photo = PhotoInfo {
+            name: String::new(),
+            width: camera.width,
+            height: camera.height,
+            group: 0,
+            focal_prior_px: None,
+            up: None,
+            camera: None,
+            mount: None,
+        };
+        let poses = [
+            DPose::IDENTITY,
+            DPose {
+                rotation: DQuat::from_scaled_axis(DVec3::new(0.3, 0.8, 0.5)),
+                position: DVec3::new(1.0, 0.4, 0.3),
+            },
+        ];
+        let mut rng = Rng::new(8, 0);
+        let mut features = vec![Features::default(); 2];
+        while features[0].keypoints.len() < points {
+            let point = DVec3::from_array([0; 3].map(|_| f64::from(rng.range(-3.0, 3.0))));
+            let local = poses.each_ref().map(|pose| pose.camera_from_world(point));
+            if local.iter().any(|p| p.z <= 0.0 || !camera.is_shown(p.truncate() / p.z)) {
+                continue;
+            }
+            for (features, p) in features.iter_mut().zip(local) {
+                let at = camera.pixel(p).as_vec2();
+                features.keypoints.push(Keypoint {
+                    x: at.x,
+                    y: at.y,
+                    scale: 2.0,
+                    angle: 0.0,
+                });
+            }
+        }
+        let matches = (0..points as u32).map(|i| [i, i]).collect();
+        let photos = [0, 1];
+        (vec![photo; 2], features, PairMatches { photos, matches })
+    }
+
+    #[test]
+    fn a_fisheye_pair_without_straight_epipolar_lines_is_verified() {
+        let camera = DCamera {
+            fisheye: true,
+            ..DCamera::centered(1000, 1000, 360.0)
+        };
+        let (photos, features, pair) = fisheye_pair(&camera, 17);
+        let options = MapOptions::default();
+        assert!(estimate_fundamental(0, &photos, &features, &pair, &options).is_none());
+        let unverified = Unverified {
+            photos: &photos,
+            features: &features,
+            pairs: &[pair],
+            options: &options,
+        };
+        let source = FocalSource::Pairs;
+        let (_, verified) = verify_with(&unverified, &[Some(GroupCamera { camera, source })], &mut |_| ());
+        assert_eq!(verified[0].matches.len(), 17);
+    }
 
     #[test]
     fn few_pairs_of_known_focal_lengths_are_checked_beside_all_others() {

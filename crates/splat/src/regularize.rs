@@ -11,6 +11,7 @@ use irradia_compute::simd::{Kernel, Lanes, Level, Mask, Simd};
 use irradia_compute::unroll;
 use irradia_scene::Camera;
 use rayon::prelude::*;
+use std::f32::consts::LN_2;
 
 /// Weights of the terms.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -209,7 +210,9 @@ fn for_each_size(log_scales: &mut Planes, change: impl Fn(usize, [&mut f32; 3]) 
         });
 }
 
-/// How large a splat may be, as seen from a camera.
+/// How large a splat may be, as seen from a camera. A footprint is the affine approximation of a splat's projection at its centre. Of a large
+/// splat beside the camera, at a depth `Z` near 0, that approximation has a standard deviation of `s f / Z` at a distance of `X f / Z` from
+/// the image, whatever `Z` is: above `s / X` = 0.3 it covers the image as a veil, although the splat itself does not enter the view.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AngleCap {
     /// Position of the camera, world.
@@ -218,18 +221,26 @@ pub struct AngleCap {
     pub largest: f32,
 }
 
-/// [`AngleCap::largest`] for photographs of wide lenses that are not cut into faces. A footprint is the affine approximation of a splat's
-/// projection, and the approximations for a lens and for a pinhole differ where the splat is large: renders through a fisheye then look
-/// right, and those through a pinhole show veils. `synth`'s room by a fisheye of 190 degrees, held-out views by a pinhole, 1,500 steps:
-/// 32.3 dB without a cap, 36.2, 37.3 and 38.0 with 0.25, 0.15 and 0.1; antialiased 39.3 with 0.1, 39.7 with 0.05.
+/// The highest [`AngleCap::largest`] for photographs of wide lenses that are not cut into faces. The approximations of a footprint for a lens
+/// and for a pinhole differ where the splat is large: renders through a fisheye then look right, and those through a pinhole show veils.
+/// `synth`'s room by a fisheye of 190 degrees, held-out views by a pinhole, 1,500 steps: 32.3 dB without a cap, 36.2, 37.3 and 38.0 with
+/// 0.25, 0.15 and 0.1; antialiased 39.3 with 0.1, 39.7 with 0.05.
 const MAX_WIDE_LENS_RATIO: f32 = 0.1;
 
 impl AngleCap {
-    /// The cap for a step whose photograph was taken by `camera`; `None` unless its lens is wide.
-    pub fn of(camera: &Camera) -> Option<Self> {
-        camera.intrinsics.lens.is_wide().then(|| Self {
+    /// The cap for a step whose photograph was taken by `camera`: `largest`, or less if its lens is wide; `None` if that is 0 and its lens
+    /// is not wide.
+    pub fn of(camera: &Camera, largest: f32) -> Option<Self> {
+        let given = if largest > 0.0 { largest } else { f32::INFINITY };
+        let allowed = if camera.intrinsics.lens.is_wide() {
+            MAX_WIDE_LENS_RATIO
+        } else {
+            f32::INFINITY
+        };
+        let largest = given.min(allowed);
+        largest.is_finite().then(|| Self {
             center: camera.pose.position.to_array(),
-            largest: MAX_WIDE_LENS_RATIO,
+            largest,
         })
     }
 }
@@ -239,6 +250,12 @@ pub fn cap_angle(splats: &mut Splats, cap: &AngleCap) {
     let (means, of_distance) = (&splats.means, cap.largest.ln());
     for_each_size(&mut splats.log_scales, |i, sizes| {
         let square: f32 = (0..3).map(|c| (means.get(c, i) - cap.center[c]).powi(2)).sum();
+        // The exponent of the number, its binary logarithm rounded down, spares nearly all splats the logarithm.
+        let exponent = (square.to_bits() >> 23) as f32 - 127.0;
+        let size = sizes.iter().fold(f32::MIN, |most, v| most.max(**v));
+        if size <= 0.5 * LN_2 * exponent + of_distance {
+            return;
+        }
         let largest = 0.5 * square.ln() + of_distance;
         // A splat at the camera itself has no finite limit.
         for v in sizes {
@@ -310,8 +327,9 @@ pub fn freeze_small(splats: &Splats, fraction: f32, of: Regularized, gradients: 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use glam::{Quat, Vec3};
     use irradia_compute::simd::Double;
-    use irradia_scene::Rng;
+    use irradia_scene::{Intrinsics, Lens, Pose, Rng};
     use irradia_testkit::finite_differences::FiniteDifferences;
 
     #[test]
@@ -414,6 +432,37 @@ mod tests {
         assert!((scale(0, 0) - 0.2f32.ln()).abs() < 1e-6, "a tenth of two");
         assert_eq!((scale(1, 0), scale(0, 1)), (-3.0, 0.0), "small enough");
         assert_eq!(scale(2, 2), 0.0, "at the camera");
+    }
+
+    #[test]
+    fn caps_hold_at_all_distances_and_are_tighter_for_wide_lenses() {
+        let pose = Pose {
+            rotation: Quat::IDENTITY,
+            position: Vec3::ZERO,
+        };
+        let mut camera = Camera::new(pose, Intrinsics::from_fov_x(8, 8, 1.0));
+        assert_eq!(AngleCap::of(&camera, 0.0), None);
+        let cap = AngleCap::of(&camera, 0.3).expect("a cap");
+        // Distances from 1e-9 to 1e9, standard deviations up to a third more and less than allowed.
+        let distances: Vec<f32> = (0..400).map(|i| 10f32.powf(0.045 * i as f32 - 9.0)).collect();
+        let mut splats = Splats::zeros(distances.len(), 0);
+        for (i, distance) in distances.iter().enumerate() {
+            splats.means.set(1, i, *distance);
+            let given = (0.3 * distance).ln();
+            (0..3).for_each(|c| splats.log_scales.set(c, i, given + 0.1 * (i as f32 + c as f32).sin()));
+        }
+        let before = splats.clone();
+        cap_angle(&mut splats, &cap);
+        for (i, distance) in distances.iter().enumerate() {
+            for c in 0..3 {
+                let expected = before.log_scales.get(c, i).min((0.3 * distance).ln());
+                assert!((splats.log_scales.get(c, i) - expected).abs() < 1e-5, "{distance}");
+            }
+        }
+        camera.intrinsics.lens = Lens::Equirectangular;
+        for (largest, expected) in [(0.0, 0.1), (0.3, 0.1), (0.05, 0.05)] {
+            assert_eq!(AngleCap::of(&camera, largest).expect("a cap").largest, expected);
+        }
     }
 
     #[test]

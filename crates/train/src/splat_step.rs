@@ -210,7 +210,7 @@ impl Trainer {
                 step: self.clock.step,
             }),
             condition_cap: (limit > 0.0).then_some(limit),
-            angle_cap: AngleCap::of(camera),
+            angle_cap: AngleCap::of(camera, plan.value(Param::AngleCap)),
         }
     }
 

@@ -31,6 +31,7 @@ mod update_flag {
     pub const ABSOLUTE: u32 = 64;
     pub const ERROR: u32 = 128;
     pub const DISTANCE: u32 = 256;
+    pub const ANGLE: u32 = 512;
 }
 
 /// Which gradients a frame on the device has.
@@ -404,6 +405,7 @@ impl GpuTraining {
             None
         };
         let noise = update.noise;
+        let largest = update.angle_cap.map_or(1.0, |cap| cap.largest);
         let bits = [
             (update.optimizer.dense, update_flag::DENSE),
             (all, update_flag::ALL),
@@ -417,10 +419,11 @@ impl GpuTraining {
             ),
             (update.statistics == Some(Statistics::Error), update_flag::ERROR),
             (rates.means_from.is_some(), update_flag::DISTANCE),
+            (update.angle_cap.is_some(), update_flag::ANGLE),
         ];
         let floats = [
             [rates.means, rates.quats, rates.log_scales, rates.opacities].map(rate),
-            [rate(rates.sh_dc), rate(rates.sh_rest), 0.0, 0.0],
+            [rate(rates.sh_dc), rate(rates.sh_rest), largest.ln(), 0.0],
             step.device_rule(),
             regularizers
                 .per_splat(f64::from(update.regularizer_unit), 1.0)

@@ -510,6 +510,17 @@ table! {
         curve: Some("loss.bilateral variation"),
         source: "Irradia: 30 if a recipe with `bilateral_grid` does not set it; gsplat: 10, for a larger grid",
     }
+    /// Largest standard deviation of a splat, relative to its distance from the camera of the step; 0 for none. For photographs of wide lenses
+    /// that are not cut into faces it is at most 0.1.
+    AngleCap {
+        name: "angle_cap",
+        unit: "",
+        default: 0.0,
+        bounds: NON_NEGATIVE,
+        group: Group::Splats,
+        curve: Some("cap.angle"),
+        source: "Irradia",
+    }
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 struct Update {
     // Learning rates of means, quaternions, ln scales, opacity logits; divided by the first moment's bias correction.
     rates: vec4f,
-    // Learning rates of SH DC and of the other coefficients; unused.
+    // Learning rates of SH DC and of the other coefficients; logarithm of the angle cap; unused.
     sh_rates: vec4f,
     // Decay of the moments, epsilon, inverse root of the second moment's bias correction.
     adam: vec4f,
@@ -28,3 +28,4 @@ const UPDATE_ABSOLUTE: u32 = 64u;
 const UPDATE_ERROR: u32 = 128u;
 // The rate of the means is relative to the distance from the camera.
 const UPDATE_DISTANCE: u32 = 256u;
+const UPDATE_ANGLE: u32 = 512u;

@@ -1,4 +1,4 @@
-// Statistics of density control, regularisers, Adam, noise and the condition cap, in this order, on everything but colours.
+// Statistics of density control, regularisers, Adam, noise and the caps, in this order, on everything but colours.
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<uniform> update: Update;
 @group(0) @binding(2) var<storage, read> visible: array<u32>;
@@ -37,6 +37,16 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
         geometry[at] = max(scales.x, low);
         geometry[at + stride] = max(scales.y, low);
         geometry[at + 2u * stride] = max(scales.z, low);
+    }
+    if has(flags, UPDATE_ANGLE) {
+        let mean = vec3f(geometry[i], geometry[stride + i], geometry[2u * stride + i]);
+        let largest = log(distance(mean, view.center.xyz)) + update.sh_rates.z;
+        // A splat at the camera itself has no finite limit.
+        if is_finite(largest) {
+            for (var p = 7u; p < 10u; p++) {
+                geometry[p * stride + i] = min(geometry[p * stride + i], largest);
+            }
+        }
     }
 }
 

@@ -3,7 +3,8 @@
 use super::{GpuRenderer, GpuTraining};
 use crate::densify::{classic, fast, mcmc, taming};
 use crate::engine::{Noise, Update};
-use crate::regularize::{Regularized, Regularizers};
+use crate::regularize::{AngleCap, Regularized, Regularizers};
+use crate::render::splat_beside_camera;
 use crate::render::{Gather, OutputGradient};
 use crate::shaders::SHADERS;
 use crate::{
@@ -196,6 +197,19 @@ fn gradients_agree_with_the_cpu() {
     gpu.check().unwrap();
 }
 
+#[test]
+fn splats_far_beside_the_image_are_not_drawn() {
+    let Some(gpu) = gpu() else { return };
+    for (sides, visible) in [(1.95, 1), (2.05, 0)] {
+        let (splats, camera) = splat_beside_camera(sides);
+        let mut engine = Engine::new(SplatState::new(splats));
+        engine.use_device(&Device::Gpu(gpu.clone())).unwrap();
+        engine.render(camera.into(), &RenderOptions::default());
+        assert_eq!(engine.visible(), visible, "{sides}");
+    }
+    gpu.check().unwrap();
+}
+
 /// An update of every parameter, with the norms of screen gradients as statistics.
 pub(super) fn usual_update() -> Update {
     Update {
@@ -240,6 +254,7 @@ fn steps_agree_with_the_cpu_under_every_option_of_an_update() {
         scale: 0.01,
         covariance: 0.1,
     };
+    let (splats, camera) = scene(4000, 2, 40);
     let updates = [
         base,
         Update {
@@ -254,17 +269,19 @@ fn steps_agree_with_the_cpu_under_every_option_of_an_update() {
             regularizers: weights,
             statistics: Some(Statistics::AbsoluteGradient),
             condition_cap: Some(50.0),
-            angle_cap: None,
             ..base
         },
         Update {
             regularizers: weights,
             regularized: Regularized::All,
             trained_fraction: 0.6,
+            angle_cap: Some(AngleCap {
+                center: camera.pose.position.to_array(),
+                largest: 0.02,
+            }),
             ..base
         },
     ];
-    let (splats, camera) = scene(4000, 2, 40);
     let by_distance = Update {
         rates: Rates {
             means_from: Some(camera.pose.position.to_array()),

@@ -26,6 +26,8 @@ pub use inspect::{Hit, Shape};
 pub use lens::LensParams;
 pub use project::{ALPHA_MIN, DILATION};
 pub use view::ViewParams;
+#[cfg(all(test, feature = "gpu"))]
+pub(crate) use view::tests::splat_beside_camera;
 
 use crate::Splats;
 use bin::{Bins, Part, TILE};

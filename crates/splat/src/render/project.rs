@@ -216,7 +216,8 @@ pub(super) fn project<F: Lanes>(
         // Some pixel centre (0.5 .. size - 0.5) must lie within the box; NaN fails both.
         let low = (xy[i] - extent[i]).le(view.size[i] - half);
         let high = half.le(xy[i] + extent[i]);
-        visible = visible.and(low).and(high);
+        let is_close = (zero - view.margin).le(xy[i]).and(xy[i].le(view.size[i] + view.margin));
+        visible = visible.and(low).and(high).and(is_close);
     }
     visible = visible
         .and(zero.lt(at.det_dilated))

@@ -4,6 +4,11 @@ use irradia_compute::simd::Simd;
 use irradia_compute::unroll;
 use irradia_scene::Camera;
 
+/// Splats centred farther outside the image than this many of its longer sides are not drawn. The affine approximation of their footprint is
+/// wrong by then: that of a large splat beside the camera covers the image, although the splat does not enter the view. No splat that the
+/// golden images show is farther outside than 1.3 sides; other viewers draw the line at 0.1 to 0.2 (antimatter15's splat, Spark).
+const MAX_SIDES_OUTSIDE: f64 = 2.0;
+
 /// A camera as the renderer uses it, in double precision for the tests.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ViewParams {
@@ -90,6 +95,7 @@ impl ViewParams {
             limits: unroll!(i in 2 => unroll!(j in 2 => simd.splat(limits[i][j]))),
             size: [simd.splat(f64::from(self.width)), simd.splat(f64::from(self.height))],
             center: unroll!(i in 3 => simd.splat(center[i])),
+            margin: simd.splat(MAX_SIDES_OUTSIDE * f64::from(self.width.max(self.height))),
             near: simd.splat(self.near),
             lens: self.lens.as_ref().map(|lens| lens.lanes(simd)),
         }
@@ -105,6 +111,48 @@ pub(super) struct ViewLanes<F> {
     pub limits: [[F; 2]; 2],
     pub size: [F; 2],
     pub center: [F; 3],
+    /// How far outside the image a centre may be, pixels.
+    pub margin: F,
     pub near: F,
     pub lens: Option<LensLanes<F>>,
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+    use crate::{RenderOptions, Renderer, Splats, logit};
+    use glam::{Quat, Vec3};
+    use irradia_scene::{Intrinsics, Pose};
+
+    /// A splat 3 units beside a camera with 50 pixels and a focal length of 50, at the depth at which its centre is `sides` sides outside
+    /// the image, with a standard deviation of 2.
+    pub fn splat_beside_camera(sides: f32) -> (Splats, Camera) {
+        let pose = Pose {
+            rotation: Quat::IDENTITY,
+            position: Vec3::ZERO,
+        };
+        let k = Intrinsics {
+            fx: 50.0,
+            fy: 50.0,
+            ..Intrinsics::from_fov_x(50, 50, 1.0)
+        };
+        let mut splats = Splats::zeros(1, 0);
+        splats.means.set(0, 0, -3.0);
+        splats.means.set(2, 0, 3.0 / (sides + 0.5));
+        splats.quats.set(0, 0, 1.0);
+        splats.opacity_logits.set(0, 0, logit(0.98));
+        (0..3).for_each(|c| splats.log_scales.set(c, 0, 2f32.ln()));
+        (splats, Camera::new(pose, k))
+    }
+
+    #[test]
+    fn splats_far_beside_the_image_do_not_veil_it() {
+        let mut renderer = Renderer::new();
+        for (sides, is_drawn) in [(0.5, true), (1.95, true), (2.05, false), (30.0, false)] {
+            let (splats, camera) = splat_beside_camera(sides);
+            renderer.render(&splats, &ViewParams::new(&camera), &RenderOptions::default());
+            let most = renderer.alpha().iter().fold(0.0f32, |most, alpha| most.max(*alpha));
+            assert_eq!(most > 0.1, is_drawn, "{sides}: {most}");
+        }
+    }
 }

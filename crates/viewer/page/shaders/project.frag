@@ -15,6 +15,7 @@ uniform mat3 u_rotation; // camera from world
 uniform vec3 u_position; // camera, world
 uniform vec2 u_focal; // pixels
 uniform vec2 u_principal;
+uniform vec2 u_size; // pixels
 uniform vec4 u_limits; // smallest x/z, largest x/z, smallest y/z, largest y/z
 uniform float u_near;
 uniform bool u_antialias;
@@ -25,6 +26,7 @@ layout(location = 0) out uvec4 place; // centre x, y; the two axes of the ellips
 layout(location = 1) out uvec4 look; // red, green; blue, opacity; reach, pixels per world unit; depth
 
 const float DILATION = 0.3;
+const float MAX_SIDES_OUTSIDE = 2.0; // as in crates/splat/src/render/view.rs
 const vec3 SELECTED = vec3(1.0, 0.72, 0.0); // as in crates/viewer/src/palette.rs
 const float SELECTED_SHARE = 0.6;
 const float C1 = 0.4886025119029199;
@@ -92,6 +94,9 @@ void main() {
   if (any(lessThan(mean, u_low)) || any(greaterThan(mean, u_high))) return;
   vec3 x = u_rotation * (mean - u_position);
   if (!(x.z > u_near)) return;
+  vec2 center = u_focal * x.xy / x.z + u_principal;
+  float margin = MAX_SIDES_OUTSIDE * max(u_size.x, u_size.y);
+  if (any(lessThan(center, vec2(-margin))) || any(greaterThan(center, u_size + margin))) return;
 
   vec2 thirdScaleAndOpacity = unpackHalf2x16(second.x);
   vec3 scale = exp(vec3(unpackHalf2x16(first.w), thirdScaleAndOpacity.x));
@@ -125,7 +130,6 @@ void main() {
   float small = max(dilated / large, 1e-6);
   vec2 direction = half_gap < 1e-9 * middle ? vec2(1.0, 0.0) : a >= c ? vec2(large - c, b) : vec2(b, large - a);
   direction = normalize(direction);
-  vec2 center = u_focal * x.xy / x.z + u_principal;
 
   if (u_degree > 0) color += harmonics(at.x, at.y, normalize(mean - u_position));
   if (u_highlight && texelFetch(u_selected, at, 0).x != 0u) color = mix(color, SELECTED, SELECTED_SHARE);

@@ -2,6 +2,8 @@
 const DILATION: f32 = 0.3;
 const ALPHA_MIN: f32 = 1.0 / 255.0;
 const COMPENSATION_FLOOR: f32 = 0.000025;
+// As in `render/view.rs`.
+const MAX_SIDES_OUTSIDE: f32 = 2.0;
 const LOG2_E: f32 = 1.4426950408889634;
 const LN_2: f32 = 0.6931471805599453;
 
@@ -101,8 +103,10 @@ fn project(g: Geometry, variance: f32) -> Footprint {
     f.depth = at.x.z;
     f.conic = vec3f(at.cov_dilated.z, -at.cov_dilated.y, at.cov_dilated.x) * inv_det;
     let image = vec2f(view.size.xy);
+    let margin = MAX_SIDES_OUTSIDE * max(image.x, image.y);
     f.visible = view.center.w < at.x.z && ALPHA_MIN <= f.opacity
         && all(f.xy - f.extent <= image - 0.5) && all(f.xy + f.extent >= vec2f(0.5))
+        && all(f.xy >= vec2f(-margin)) && all(f.xy <= image + margin)
         && at.det_dilated > 0.0 && at.det_dilated < 1e30;
     return f;
 }

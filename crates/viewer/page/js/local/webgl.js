@@ -211,6 +211,7 @@ export class WebGl {
     gl.uniform3fv(at("u_position"), camera.position);
     gl.uniform2f(at("u_focal"), k.fx, k.fy);
     gl.uniform2f(at("u_principal"), k.cx, k.cy);
+    gl.uniform2f(at("u_size"), k.width, k.height);
     const [mx, my] = [(0.15 * k.width) / k.fx, (0.15 * k.height) / k.fy];
     gl.uniform4f(at("u_limits"), -(k.cx / k.fx + mx), (k.width - k.cx) / k.fx + mx, -(k.cy / k.fy + my), (k.height - k.cy) / k.fy + my);
     gl.uniform1f(at("u_near"), near);

@@ -1,6 +1,7 @@
 //! The empty space around cameras. A camera stands in free space, and nothing that its view is known to see is closer than its
 //! nearest points; splats closer than a fraction of that depth explain one photograph each, and veil the views in between. Only splats
-//! around a nearer point that many views see, such as the tip of a leaf, are kept.
+//! around a nearer point that many views see, such as the tip of a leaf, are kept. Little is known about the space around a camera that
+//! stands among surfaces which its view does not show, as in a room: smooth walls have no points.
 
 use glam::Vec3;
 use irradia_scene::{Dataset, PointCloud, View};
@@ -13,6 +14,11 @@ const MIN_POINTS: usize = 20;
 const MAX_OUTLIER_FRACTION: f64 = 0.02;
 /// The fraction of all points that may lie in a sphere.
 const MAX_STRAY_FRACTION: f64 = 0.001;
+/// The factor on the radius around a camera that stands among surfaces: points that its view need not show are closer than the radius. Held-out
+/// PSNR, 480 pixels, 1,000 steps, with radii limited by the distance to these points, and with a seventh of the radius around all cameras:
+/// offices 28.52, 29.00 dB; small room 26.65, 27.06; campus 22.29, 22.52; courthouse 18.49, 18.87. Of the cameras there 54 to 95 % stand among
+/// surfaces, of nine captures of objects and façades 0 to 8 %. A mouse on a table needs the whole radius (25.85, 23.99).
+const AMONG_SURFACES: f32 = 1.0 / 7.0;
 /// Minimum number of views that see a point for it to be certain. Held-out PSNR without support and with that of points seen by 3 and 6: a
 /// plant in a room, with some photographs taken from among its leaves, 23.25, 23.54, 23.38 dB; mouse, whose table has wrong points, 24.23,
 /// 23.82, 24.23; lund_door and maryRose the same.
@@ -53,8 +59,9 @@ impl FreeSpace {
         let sphere = |view: &usize| {
             let view = &dataset.views[*view];
             let mut radius = fraction * nearest_depth(dataset, view)?;
-            if let Some(points) = &dataset.points {
-                radius = radius.min(distance_to_points(points, view));
+            let around = dataset.points.as_ref().map(|points| distance_to_points(points, view));
+            if let Some(around) = around.filter(|around| *around < radius) {
+                radius = around.min(AMONG_SURFACES * radius);
             }
             let center = view.camera.pose.position;
             let near = certain
@@ -200,10 +207,10 @@ pub(crate) mod tests {
 
     #[test]
     fn splats_before_a_camera_go_and_surfaces_around_it_stay() {
-        let depths = [-2.0, -0.9, 0.5, 0.99, 1.2, 2.9, 10.0];
-        // The wall behind the camera limits the sphere to 1.
+        let depths = [-2.0, -0.9, 0.2, 0.4, 0.5, 0.99, 1.2, 2.9, 10.0];
+        // The wall behind the camera is closer than 3: the sphere has a seventh of that, 0.43.
         let space = FreeSpace::new(&dataset(102, None), 0.3);
-        assert_eq!(left(&space, &depths), [-2.0, 1.2, 2.9, 10.0]);
+        assert_eq!(left(&space, &depths), [-2.0, -0.9, 0.5, 0.99, 1.2, 2.9, 10.0]);
         let mut open = dataset(102, None);
         let points = open.points.as_mut().unwrap();
         points.positions.truncate(102);

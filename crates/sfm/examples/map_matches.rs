@@ -35,14 +35,8 @@ fn main() {
         let name = String::from_utf8((0..length).map(|_| file.bytes::<1>()[0]).collect()).expect("names are UTF-8");
         let (width, height, focal) = (file.u32(), file.u32(), file.f64());
         photos.push(PhotoInfo {
-            name,
-            width,
-            height,
-            group: 0,
             focal_prior_px: (focal > 0.0).then_some(focal),
-            up: None,
-            camera: None,
-            mount: None,
+            ..PhotoInfo::new(name, width, height)
         });
         let keypoints = (0..file.u32())
             .map(|_| Keypoint {

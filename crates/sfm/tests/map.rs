@@ -166,14 +166,8 @@ fn repetitive_wall(photos: usize, camera: DCamera) -> (Vec<DVec3>, Vec<PhotoInfo
 /// A photograph by a known camera.
 fn photo() -> PhotoInfo {
     PhotoInfo {
-        name: String::new(),
-        width: CAMERA.width,
-        height: CAMERA.height,
-        group: 0,
-        focal_prior_px: None,
-        up: None,
         camera: Some(CAMERA),
-        mount: None,
+        ..PhotoInfo::new(String::new(), CAMERA.width, CAMERA.height)
     }
 }
 

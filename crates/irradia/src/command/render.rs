@@ -109,11 +109,10 @@ fn film(args: &Args, scene: &Scene) -> Result<Option<Film>> {
     if let Some(frames) = args.orbit {
         return Ok(Some(Film::orbit(scene, frames, args.size)));
     }
-    let Some(path) = args.path.as_deref() else {
+    let Some(path) = args.path.as_deref().map(CameraPath::of) else {
         return Ok(None);
     };
-    let is_file = !GENERATED_PATHS.iter().any(|name| path.as_os_str() == *name);
-    if let Some(frames) = args.frames.filter(|_| is_file) {
+    if let (CameraPath::File(path), Some(frames)) = (path, args.frames) {
         let path = path.display();
         return Err(Usage(format!(
             "--frames {frames}: the number of frames of {path} is in the file: omit it"
@@ -123,27 +122,43 @@ fn film(args: &Args, scene: &Scene) -> Result<Option<Film>> {
     film_from_path(path, &args.scene, scene, args.frames.unwrap_or(PATH_FRAMES), args.size).map(Some)
 }
 
-/// Names of paths that are made around a scene; any other one is that of a file.
-const GENERATED_PATHS: [&str; 3] = ["orbit", "spiral", "training"];
+/// What `--path` names.
+#[derive(Clone, Copy)]
+pub(super) enum CameraPath<'a> {
+    Orbit,
+    Spiral,
+    Training,
+    File(&'a Path),
+}
 
-/// The cameras of the path `path` around the scene that was read from `source`: a file, `orbit`, `spiral` or `training`, which have
-/// `frames` frames.
+impl<'a> CameraPath<'a> {
+    pub(super) fn of(path: &'a Path) -> Self {
+        match path.to_str() {
+            Some("orbit") => Self::Orbit,
+            Some("spiral") => Self::Spiral,
+            Some("training") => Self::Training,
+            _ => Self::File(path),
+        }
+    }
+}
+
+/// The cameras of `path` around the scene that was read from `source`; those that are not in a file have `frames` frames.
 pub(super) fn film_from_path(
-    path: &Path,
+    path: CameraPath,
     source: &Path,
     scene: &Scene,
     frames: u32,
     size: Option<(u32, u32)>,
 ) -> Result<Film> {
-    Ok(match path.to_str() {
-        Some("orbit") => Film::orbit(scene, frames, size),
-        Some("spiral") => Film::spiral(scene, frames, size),
-        Some("training") => {
+    Ok(match path {
+        CameraPath::Orbit => Film::orbit(scene, frames, size),
+        CameraPath::Spiral => Film::spiral(scene, frames, size),
+        CameraPath::Training => {
             let names = camera_names(&scene_path(source)).unwrap_or_default();
             let film = Film::training(scene, &names, frames, size);
             film.ok_or_else(|| Usage("--path training: the cameras of this scene are not known".into()))?
         }
-        _ => {
+        CameraPath::File(path) => {
             let k = scene.orbit_geometry().intrinsics;
             let moved = moved_from_run(&scene_path(source));
             let world_from_photographs = moved.then(&Transform::to_world(&scene.world_from_dataset));

@@ -1,6 +1,6 @@
 //! `irradia share`
 
-use super::render::film_from_path;
+use super::render::{CameraPath, film_from_path};
 use super::size::file_size;
 use super::warn;
 use crate::Usage;
@@ -41,8 +41,9 @@ const FLIGHT_FRAMES: u32 = 300;
 
 /// The flight along `path` around the scene that was read from `source`; an orbit or spiral ends where it began.
 fn flight(path: &Path, source: &Path, scene: &Scene) -> Result<Film> {
+    let path = CameraPath::of(path);
     let mut film = film_from_path(path, source, scene, FLIGHT_FRAMES, None)?;
-    if path.as_os_str() != "training" && !path.is_file() {
+    if matches!(path, CameraPath::Orbit | CameraPath::Spiral) {
         film.cameras.extend(film.cameras.first().copied());
     }
     if film.cameras.is_empty() {

@@ -35,14 +35,9 @@ impl ViewFeatures {
             mask: mask.as_deref(),
         });
         let info = PhotoInfo {
-            name: view.name.clone(),
-            width: k.width,
-            height: k.height,
-            group: 0,
             focal_prior_px: Some(f64::from(k.fx)),
-            up: None,
             camera: Some(DCamera::pinhole(&k)),
-            mount: None,
+            ..PhotoInfo::new(view.name.clone(), k.width, k.height)
         };
         let color = |x, y| color_at(&photo.data, [photo.width, photo.height], photo.channels, x, y);
         let colors = features.keypoints.iter().map(|k| color(k.x, k.y)).collect();

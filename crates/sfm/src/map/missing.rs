@@ -125,16 +125,7 @@ mod tests {
 
     /// Two photographs from one place, `turned` apart, each of which shows 50 points straight ahead that the other does not show.
     fn overlaps_of(turned: f64) -> usize {
-        let photo = PhotoInfo {
-            name: String::new(),
-            width: 1000,
-            height: 750,
-            group: 0,
-            focal_prior_px: None,
-            up: None,
-            camera: None,
-            mount: None,
-        };
+        let photo = PhotoInfo::new(String::new(), 1000, 750);
         let mut camera = DCamera::centered(1000, 750, 600.0);
         camera.parameters[4] = -0.25;
         let poses = [0.0, turned].map(|angle| DPose {

@@ -36,6 +36,20 @@ pub struct PhotoInfo {
 }
 
 impl PhotoInfo {
+    /// A photograph of `width` x `height` pixels in group 0, of which nothing else is known.
+    pub fn new(name: String, width: u32, height: u32) -> Self {
+        Self {
+            name,
+            width,
+            height,
+            group: 0,
+            focal_prior_px: None,
+            up: None,
+            camera: None,
+            mount: None,
+        }
+    }
+
     /// The longer side, px.
     pub(crate) fn long_side(&self) -> f64 {
         f64::from(self.width.max(self.height))

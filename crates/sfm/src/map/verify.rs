@@ -383,16 +383,7 @@ mod tests {
 
     /// Two photographs of a room by a fisheye, and the matches of `points` points.
     fn fisheye_pair(camera: &DCamera, points: usize) -> (Vec<PhotoInfo>, Vec<Features>, PairMatches) {
-        let photo = PhotoInfo {
-            name: String::new(),
-            width: camera.width,
-            height: camera.height,
-            group: 0,
-            focal_prior_px: None,
-            up: None,
-            camera: None,
-            mount: None,
-        };
+        let photo = PhotoInfo::new(String::new(), camera.width, camera.height);
         let poses = [
             DPose::IDENTITY,
             DPose {

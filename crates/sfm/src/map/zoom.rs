@@ -373,16 +373,7 @@ mod tests {
             ..Features::default()
         };
         let features = (0..12).map(of_photo).collect();
-        let photo = PhotoInfo {
-            name: String::new(),
-            width: 1000,
-            height: 1000,
-            group: 0,
-            focal_prior_px: None,
-            up: None,
-            camera: None,
-            mount: None,
-        };
+        let photo = PhotoInfo::new(String::new(), 1000, 1000);
         let seen = points.iter().enumerate().map(|(i, position)| ModelPoint {
             position: *position,
             track: (0..12).map(|photo| (photo, i as u32)).collect(),

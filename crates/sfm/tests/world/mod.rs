@@ -111,16 +111,9 @@ impl World {
                 keypoints,
                 ..Features::default()
             });
-            world.photos.push(PhotoInfo {
-                name: format!("{i:03}.jpg"),
-                width: camera.width,
-                height: camera.height,
-                group: 0,
-                focal_prior_px: None,
-                up: None,
-                camera: None,
-                mount: None,
-            });
+            world
+                .photos
+                .push(PhotoInfo::new(format!("{i:03}.jpg"), camera.width, camera.height));
         }
         for a in 0..shown.len() {
             for b in a + 1..shown.len() {

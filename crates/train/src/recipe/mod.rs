@@ -79,8 +79,9 @@ documented! {
         #[serde(default, skip_serializing_if = "Option::is_none")]
         pub splats_per_pixel: Option<f32>,
         /// Radius around each training camera within which splats are removed at every round of density control, as a fraction of
-        /// the depth of the nearest points that its view sees (or of its depth bounds); 0 for none. If it is above 0 and photographs are at
-        /// least 8 degrees apart, splats that only one of them sees, among other cameras and away from points, are moved far away.
+        /// the depth of the nearest points that its view sees (or of its depth bounds); at most a seventh of that where points that the view
+        /// need not show are closer; 0 for none. If it is above 0 and photographs are at least 8 degrees apart, splats that only one of them
+        /// sees, among other cameras and away from points, are moved far away.
         #[serde(default, skip_serializing_if = "is_default")]
         pub free_space: f32,
         /// The length to which `rate_means` is relative, in pixels of the training images at the distance of each splat from the camera of

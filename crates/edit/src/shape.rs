@@ -92,7 +92,7 @@ pub enum Shape {
         #[serde(default, skip_serializing_if = "is_false")]
         visible: bool,
     },
-    /// A range of colours, without their dependence on direction.
+    /// A range of colours, without their dependence on direction. Colours beyond black or white count as black or white.
     Color {
         /// Lowest red, green and blue.
         low: [f64; 3],

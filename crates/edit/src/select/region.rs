@@ -40,9 +40,11 @@ pub(super) fn in_property_range(draft: &Draft, shape: &Shape) -> Selection {
     match *shape {
         Shape::Color { low, high } => {
             let width = 3 * cloud.sh_coefficients();
+            // Colours of splats may be beyond black and white, and so may bounds around such a colour.
+            let (low, high) = (low.map(|v| v.min(1.0)), high.map(|v| v.max(0.0)));
             Selection::of(n, |i| {
                 (0..3).all(|c| {
-                    let color = f64::from(sh::color_from_dc(cloud.sh[i * width + c]).max(0.0));
+                    let color = f64::from(sh::color_from_dc(cloud.sh[i * width + c]).clamp(0.0, 1.0));
                     (low[c]..=high[c]).contains(&color)
                 })
             })

@@ -69,6 +69,22 @@ fn ranges_contain_what_is_like_them() {
 }
 
 #[test]
+fn colours_beyond_black_and_white_are_black_and_white() {
+    let mut scene = at(&[[0.0; 3]; 4]);
+    let colors = [[-0.3; 3], [0.0; 3], [1.0; 3], [1.4; 3]];
+    scene.cloud.sh = colors.as_flattened().iter().map(|c| sh::dc_from_color(*c)).collect();
+    for (words, expected) in [
+        ("color low=0.9,0.9,0.9 high=1,1,1", vec![2, 3]),
+        ("color low=0,0,0 high=0.1,0.1,0.1", vec![0, 1]),
+        // As the page's dropper asks for colours like that of a splat.
+        ("color low=1.3,1.3,1.3 high=1.5,1.5,1.5", vec![2, 3]),
+        ("color low=-0.4,-0.4,-0.4 high=-0.2,-0.2,-0.2", vec![0, 1]),
+    ] {
+        assert_eq!(selected(&scene, words).indices(), expected, "{words}");
+    }
+}
+
+#[test]
 fn selections_are_sets() {
     let scene = draft(500, 0);
     let (a, b) = ("sphere center=0.5,0,0 radius=0.7", "box center=0,0.5,0 size=1,1,1");

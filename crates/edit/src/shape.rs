@@ -313,7 +313,12 @@ impl SelectStep {
             }
             Shape::Color { low, high } => {
                 check_finite("color low", low)?;
-                check_finite("color high", high)
+                check_finite("color high", high)?;
+                if low.iter().zip(high).all(|(low, high)| low <= high) {
+                    Ok(())
+                } else {
+                    Err(EditError::value("color", "low must not be above high"))
+                }
             }
             Shape::Opacity { min, max } => check_range("opacity", min.as_ref(), max.as_ref()),
             Shape::Size { min, max } => check_range("size", min.as_ref(), max.as_ref()),

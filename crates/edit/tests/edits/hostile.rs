@@ -76,6 +76,10 @@ fn lists_are_checked_key_by_key() {
         (&edit("{ shape = \"opacity\", min = nan }"), "must be numbers"),
         (&edit("{ shape = \"size\", min = 2, max = 1 }"), "above max"),
         (&edit("{ shape = \"views\", min = -1 }"), "edit 1:"),
+        (
+            &edit("{ shape = \"color\", low = [0, 0.5, 0], high = [1, 0.4, 1] }"),
+            "low must not be above high",
+        ),
         (&edit("{ mode = \"xor\", shape = \"all\" }"), "unknown variant `xor`"),
         (&edit("{ mode = \"subtract\", shape = \"invert\" }"), "no mode"),
         ("version = 1\n[[edits]]\nop = \"move\"\nby = [0, 0,", "line"),

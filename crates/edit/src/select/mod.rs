@@ -32,6 +32,9 @@ pub(crate) fn select_among(
     selectable: &Selection,
 ) -> Result<Selection, EditError> {
     steps.iter().try_for_each(SelectStep::check)?;
+    // Hidden splats are as if they were not there, unless they are to be shown.
+    let mut present = draft.visible();
+    present.add(selectable);
     let begins_full = steps.first().is_some_and(|step| step.mode != Mode::Add);
     let mut selected = if begins_full {
         Selection::all(draft.len())
@@ -42,9 +45,9 @@ pub(crate) fn select_among(
         match &step.shape {
             Shape::Invert {} => selected.invert(),
             Shape::Grow { by } => selected = space::grow(draft, &selected, *by),
-            Shape::Connected { gap } => selected = space::connected(draft, &selected, *gap),
+            Shape::Connected { gap } => selected = space::connected(draft, &present, &selected, *gap),
             shape => {
-                let inside = evaluate(draft, shape)?;
+                let inside = evaluate(draft, &present, shape)?;
                 match step.mode {
                     Mode::Add => selected.add(&inside),
                     Mode::Subtract => selected.subtract(&inside),
@@ -57,8 +60,8 @@ pub(crate) fn select_among(
     Ok(selected)
 }
 
-/// The splats in one shape.
-fn evaluate(draft: &Draft, shape: &Shape) -> Result<Selection, EditError> {
+/// The splats in one shape; clusters are those of the splats `present`.
+fn evaluate(draft: &Draft, present: &Selection, shape: &Shape) -> Result<Selection, EditError> {
     Ok(match shape {
         Shape::All {} => Selection::all(draft.len()),
         Shape::Last {} => draft.last.clone(),
@@ -77,7 +80,7 @@ fn evaluate(draft: &Draft, shape: &Shape) -> Result<Selection, EditError> {
             radius,
             visible,
         } => screen::visible_only(draft, camera, *visible, screen::brush(draft, camera, points, *radius)),
-        Shape::Clusters { min, max, gap } => space::clusters(draft, *min, *max, *gap),
+        Shape::Clusters { min, max, gap } => space::clusters(draft, present, [*min, *max], *gap),
         Shape::Views { min, max } => {
             if draft.cameras.is_empty() {
                 return Err(EditError::NoCameras("views"));

@@ -1,6 +1,7 @@
 //! Selections by neighbourhood: growing, connection and clusters. The last two work on the cells of a grid, so that the cost is linear in
 //! the number of splats.
 
+use crate::draft::median;
 use crate::{Draft, Selection};
 use glam::DVec3;
 use irradia_splat::Nearest;
@@ -43,19 +44,23 @@ pub(super) fn grow(draft: &Draft, selected: &Selection, by: f64) -> Selection {
 
 /// The connected component of each splat, and the number of splats in each component; touching cells of side `gap` are connected.
 struct Components {
+    /// Splats that do not take part are in a component of their own, which has size 0.
     labels: Vec<u32>,
     sizes: Vec<usize>,
 }
 
-fn components(draft: &Draft, gap: Option<f64>) -> Components {
+/// The components of the splats `present`.
+fn components(draft: &Draft, present: &Selection, gap: Option<f64>) -> Components {
+    let indices = present.indices();
     let side = gap
-        .unwrap_or_else(|| DEFAULT_GAP_FACTOR * median_neighbour_distance(draft))
+        .unwrap_or_else(|| DEFAULT_GAP_FACTOR * median_neighbour_distance(draft, &indices))
         .max(f64::MIN_POSITIVE);
     let mut numbers: HashMap<Cell, u32> = HashMap::new();
     let mut cells: Vec<Cell> = Vec::new();
-    let cell_of_splat: Vec<u32> = (0..draft.len())
+    let cell_of_splat: Vec<u32> = indices
+        .iter()
         .map(|i| {
-            let cell = cell_of(draft.position(i), side);
+            let cell = cell_of(draft.position(*i as usize), side);
             *numbers.entry(cell).or_insert_with(|| {
                 cells.push(cell);
                 cells.len() as u32 - 1
@@ -82,15 +87,18 @@ fn components(draft: &Draft, gap: Option<f64>) -> Components {
         }
         count += 1;
     }
-    let labels: Vec<u32> = cell_of_splat.iter().map(|cell| component[*cell as usize]).collect();
-    let mut sizes = vec![0; count as usize];
-    labels.iter().for_each(|component| sizes[*component as usize] += 1);
+    let (mut labels, mut sizes) = (vec![count; draft.len()], vec![0; count as usize + 1]);
+    for (i, cell) in indices.iter().zip(cell_of_splat) {
+        let label = component[cell as usize];
+        labels[*i as usize] = label;
+        sizes[label as usize] += 1;
+    }
     Components { labels, sizes }
 }
 
-/// The selection, and everything connected to it.
-pub(super) fn connected(draft: &Draft, selected: &Selection, gap: Option<f64>) -> Selection {
-    let components = components(draft, gap);
+/// The selection, and everything connected to it by the splats `present`.
+pub(super) fn connected(draft: &Draft, present: &Selection, selected: &Selection, gap: Option<f64>) -> Selection {
+    let components = components(draft, present, gap);
     let mut reached = vec![false; components.sizes.len()];
     for i in selected.indices() {
         reached[components.labels[i as usize] as usize] = true;
@@ -98,28 +106,27 @@ pub(super) fn connected(draft: &Draft, selected: &Selection, gap: Option<f64>) -
     Selection::of(draft.len(), |i| reached[components.labels[i] as usize])
 }
 
-/// The splats in components of `min` to `max` splats.
-pub(super) fn clusters(draft: &Draft, min: Option<usize>, max: Option<usize>, gap: Option<f64>) -> Selection {
-    let components = components(draft, gap);
+/// The splats in components of `min` to `max` of the splats `present`.
+pub(super) fn clusters(
+    draft: &Draft,
+    present: &Selection,
+    [min, max]: [Option<usize>; 2],
+    gap: Option<f64>,
+) -> Selection {
+    let components = components(draft, present, gap);
     let range = min.unwrap_or(0)..=max.unwrap_or(usize::MAX);
     Selection::of(draft.len(), |i| {
         range.contains(&components.sizes[components.labels[i] as usize])
     })
 }
 
-/// Median distance of splats to their nearest neighbours, dataset units; 1 if there are fewer than two.
-pub(crate) fn median_neighbour_distance(draft: &Draft) -> f64 {
-    let means = &draft.cloud.means;
-    if means.len() < 2 {
+/// Median distance of the splats `indices` to their nearest neighbours among them, dataset units; 1 if there are fewer than two.
+fn median_neighbour_distance(draft: &Draft, indices: &[u32]) -> f64 {
+    if indices.len() < 2 {
         return 1.0;
     }
-    let tree = Nearest::new(means);
-    let mut squares: Vec<f32> = means
-        .par_iter()
-        .with_min_len(1024)
-        .map(|mean| tree.of::<2>(*mean)[1].0)
-        .collect();
-    let middle = squares.len() / 2;
-    let square = *squares.select_nth_unstable_by(middle, f32::total_cmp).1;
-    f64::from(square).sqrt().max(1e-9) / draft.cloud.world_from_dataset.scale
+    let means: Vec<[f32; 3]> = indices.iter().map(|i| draft.cloud.means[*i as usize]).collect();
+    let tree = Nearest::new(&means);
+    let squares = means.par_iter().with_min_len(1024).map(|mean| tree.of::<2>(*mean)[1].0);
+    f64::from(median(squares.collect())).sqrt().max(1e-9) / draft.cloud.world_from_dataset.scale
 }

@@ -84,6 +84,32 @@ fn colours_beyond_black_and_white_are_black_and_white() {
     }
 }
 
+/// A bridge of splats between two groups connects them until it is hidden.
+#[test]
+fn hidden_splats_connect_nothing() {
+    let bridge = at(&[0.0, 0.1, 0.2, 1.0, 2.0, 3.0, 4.0, 4.1].map(|x| [x, 0.0, 0.0]));
+    let hidden = crate::edited(&bridge, &["hide box center=2,0,0 size=2.2,1,1"]);
+    let left = "sphere center=0,0,0 radius=0.05";
+    for (words, expected) in [
+        ("connected gap=1.05", vec![0, 1, 2]),
+        ("connected gap=1.05 clusters min=3 gap=1.05", vec![0, 1, 2]),
+        ("connected gap=1.05 clusters max=2 gap=1.05", vec![0, 1, 2, 6, 7]),
+    ] {
+        let words = format!("{left} {words}");
+        assert_eq!(selected(&bridge, &words), Selection::all(8), "{words}");
+        assert_eq!(selected(&hidden, &words).indices(), expected, "{words}");
+    }
+    // The splats to show are present.
+    let shown = crate::edited(&hidden, &["show clusters min=8 gap=1.05"]);
+    assert!(shown.hidden.is_empty());
+    // What is locked is seen, and connects.
+    let locked = crate::edited(&bridge, &["lock box center=2,0,0 size=2.2,1,1"]);
+    assert_eq!(
+        selected(&locked, &format!("{left} connected gap=1.05")).indices(),
+        [0, 1, 2, 6, 7]
+    );
+}
+
 #[test]
 fn selections_are_sets() {
     let scene = draft(500, 0);

@@ -93,13 +93,6 @@ pub(crate) fn median(mut values: Vec<f32>) -> f32 {
 
 /// The splats `indices`, in that order.
 pub(crate) fn gather(cloud: &GaussianCloud, indices: &[u32]) -> GaussianCloud {
-    fn rows<T: Copy + Send + Sync>(column: &[T], indices: &[u32]) -> Vec<T> {
-        indices
-            .par_iter()
-            .with_min_len(1024)
-            .map(|i| column[*i as usize])
-            .collect()
-    }
     let width = 3 * cloud.sh_coefficients();
     let mut harmonics = vec![0.0; indices.len() * width];
     harmonics
@@ -108,23 +101,32 @@ pub(crate) fn gather(cloud: &GaussianCloud, indices: &[u32]) -> GaussianCloud {
         .zip(indices)
         .for_each(|(to, i)| to.copy_from_slice(&cloud.sh[*i as usize * width..][..width]));
     GaussianCloud {
+        sh: harmonics,
+        sh_degree: cloud.sh_degree,
+        extra: cloud.extra.iter().map(|column| column.gather(indices)).collect(),
+        ..gather_gray(cloud, indices)
+    }
+}
+
+/// The splats `indices`, in that order, in grey and without extra columns: a quarter of the memory.
+pub(crate) fn gather_gray(cloud: &GaussianCloud, indices: &[u32]) -> GaussianCloud {
+    fn rows<T: Copy + Send + Sync>(column: &[T], indices: &[u32]) -> Vec<T> {
+        indices
+            .par_iter()
+            .with_min_len(1024)
+            .map(|i| column[*i as usize])
+            .collect()
+    }
+    GaussianCloud {
         means: rows(&cloud.means, indices),
         quats: rows(&cloud.quats, indices),
         log_scales: rows(&cloud.log_scales, indices),
         opacity_logits: rows(&cloud.opacity_logits, indices),
-        sh: harmonics,
-        extra: cloud.extra.iter().map(|column| column.gather(indices)).collect(),
-        ..empty_like(cloud)
-    }
-}
-
-/// An empty cloud with the world and degree of `cloud`.
-pub(crate) fn empty_like(cloud: &GaussianCloud) -> GaussianCloud {
-    GaussianCloud {
-        sh_degree: cloud.sh_degree,
+        sh: vec![0.0; 3 * indices.len()],
+        sh_degree: 0,
         antialiased: cloud.antialiased,
         world_from_dataset: cloud.world_from_dataset,
-        ..GaussianCloud::default()
+        extra: Vec::new(),
     }
 }
 

@@ -1,6 +1,6 @@
 //! What cameras see of each splat.
 
-use crate::draft::gather;
+use crate::draft::gather_gray;
 use crate::{Draft, Selection};
 use glam::Vec3;
 use irradia_scene::Camera;
@@ -53,14 +53,13 @@ impl Observer {
     pub fn new(draft: &Draft, of: &Selection) -> Self {
         let indices = of.indices();
         Self {
-            splats: Splats::from_cloud(&gather(&draft.cloud, &indices)),
+            // Colours do not matter.
+            splats: Splats::from_cloud(&gather_gray(&draft.cloud, &indices)),
             indices,
             count: draft.len(),
             options: RenderOptions {
                 antialias: draft.cloud.antialiased,
                 depth: true,
-                // Colours do not matter.
-                sh_degree: 0,
                 ..RenderOptions::default()
             },
             renderer: Renderer::new(),

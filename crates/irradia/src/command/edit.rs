@@ -53,8 +53,9 @@ Operations: delete, keep, move by=X,Y,Z, rotate axis=X,Y,Z degrees=D [about=X,Y,
 [exposure=] [temperature=] [tint=] [saturation=] [contrast=], opacity factor=F, reduce count=N, hide, show, lock, unlock, split name=NAME
 
 Shapes: all, box center=X,Y,Z size=X,Y,Z [rotation=W,X,Y,Z], sphere center=X,Y,Z radius=R, half-space point=X,Y,Z normal=X,Y,Z, \
-polygon camera.*=.. points=X,Y;X,Y;.. [visible=true], brush camera.*=.. points=X,Y;.. radius=R (docs/edit.md), color low=R,G,B high=R,G,B, opacity|size|elongation|views [min=] [max=], clusters [min=] [max=] [gap=], floaters \
-[score=], subject [margin=]; of the selection so far: invert, grow by=R, connected [gap=]
+polygon camera.*=.. points=X,Y;X,Y;.. [visible=true], brush camera.*=.. points=X,Y;.. radius=R (docs/edit.md), color low=R,G,B \
+high=R,G,B, opacity|size|elongation|views [min=] [max=], clusters [min=] [max=] [gap=], floaters [score=], subject [margin=], last (what \
+the edit before selected or added); of the selection so far: invert, grow by=R, connected [gap=]
 
 Examples:
   irradia edit run -o clean.ply \"delete floaters\"

@@ -20,7 +20,7 @@ const TABLE: &[(&str, May)] = &[
     ("sfm", Import(&["scene", "compute"])),
     ("splat", Import(&["scene", "compute"])),
     ("field", Import(&["scene", "compute"])),
-    ("edit", Import(&["scene", "compute", "splat"])),
+    ("edit", Import(&["scene", "splat"])),
     ("measure", Import(&["scene", "compute"])),
     ("train", Import(&["scene", "compute", "splat", "field", "measure"])),
     ("synth", Import(&["scene"])),

@@ -18,8 +18,9 @@ use irradia_scene::Image;
 pub struct Evaluation {
     /// Peak signal-to-noise ratio, dB; infinite where the images are equal.
     pub psnr: f64,
-    /// PSNR, dB, after the best affine colour map from render to photograph (gsplat's `color_correct`), which removes differences in
-    /// exposure and white balance.
+    /// PSNR, dB, after the best affine colour map from render to photograph, which removes differences in exposure and white balance. Not
+    /// comparable with the figures of others: the map of multinerf's `color_correct` is quadratic, that of gsplat's `color_correct_affine`
+    /// has no terms between channels.
     pub psnr_corrected: f64,
     /// Mean structural similarity, at most 1.
     pub ssim: f64,

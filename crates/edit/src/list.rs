@@ -2,6 +2,7 @@
 
 use crate::EditError;
 use crate::shape::{SelectStep, check_direction, check_finite, check_positive};
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 /// The version of the layout that is written and read.
@@ -286,10 +287,20 @@ impl Edit {
         }
     }
 
-    pub(crate) fn from_table(table: toml::Table) -> Result<Self, EditError> {
-        let edit: Self = table
-            .try_into()
-            .map_err(|error: toml::de::Error| EditError::Syntax(error.message().replace('\n', " ")))?;
+    pub(crate) fn from_table(mut table: toml::Table) -> Result<Self, EditError> {
+        let select = table.remove("select");
+        let op = from_tagged(table, "op")?;
+        let select = match select {
+            None => None,
+            Some(toml::Value::Array(steps)) => Some(
+                steps
+                    .into_iter()
+                    .map(|step| from_tagged(step, "shape"))
+                    .collect::<Result<_, _>>()?,
+            ),
+            Some(_) => return Err(EditError::Syntax("select is not a list of shapes".into())),
+        };
+        let edit = Self { op, select };
         edit.check()?;
         Ok(edit)
     }
@@ -302,7 +313,7 @@ impl Edit {
         let name = self.op.name();
         match (&self.select, self.op.scope()) {
             (None, Scope::Selection) => {
-                let example = "such as: sphere center=0,0,0 radius=1";
+                let example = "such as in \"delete sphere center=0,0,0 radius=1\"";
                 return Err(EditError::Selection(format!("{name} needs a selection, {example}")));
             }
             (Some(_), Scope::Scene) => {
@@ -384,6 +395,15 @@ impl Edit {
             | Operation::Unlock {} => Ok(()),
         }
     }
+}
+
+/// An operation or a selection's step from the table whose entry `tag` is its name, with which an error begins.
+fn from_tagged<T: DeserializeOwned>(table: impl Into<toml::Value>, tag: &str) -> Result<T, EditError> {
+    let table = table.into();
+    let name = table.get(tag).and_then(toml::Value::as_str).unwrap_or(tag).to_owned();
+    table
+        .try_into()
+        .map_err(|error: toml::de::Error| EditError::Syntax(format!("{name}: {}", error.message().replace('\n', " "))))
 }
 
 fn check_within(name: &str, value: f64, low: f64, high: f64) -> Result<(), EditError> {

@@ -79,20 +79,23 @@ fn split_words(text: &str) -> Result<Vec<String>, EditError> {
     Ok(words)
 }
 
-/// Inserts `value` under `key`; a dot in the key opens a table.
+/// Inserts `value` under `key`; the first dot in the key opens a table.
 fn insert(table: &mut Table, key: &str, value: Value) -> Result<(), &'static str> {
     let reserved = ["op", "select", "mode", "shape"];
     if key.is_empty() || reserved.contains(&key) {
         return Err("not a key");
     }
-    let Some((outer, inner)) = key.split_once('.') else {
-        return match table.insert(key.to_owned(), value) {
-            None => Ok(()),
-            Some(_) => Err("given twice"),
-        };
+    let (table, key) = match key.split_once('.') {
+        None => (table, key),
+        Some((outer, inner)) => {
+            let entry = table.entry(outer).or_insert_with(|| Value::Table(Table::new()));
+            (entry.as_table_mut().ok_or("given twice")?, inner)
+        }
     };
-    let entry = table.entry(outer).or_insert_with(|| Value::Table(Table::new()));
-    insert(entry.as_table_mut().ok_or("given twice")?, inner, value)
+    match table.insert(key.to_owned(), value) {
+        None => Ok(()),
+        Some(_) => Err("given twice"),
+    }
 }
 
 /// Parses a number, a vector, a list of vectors or a Boolean; anything else, and anything in quotes, is a word.

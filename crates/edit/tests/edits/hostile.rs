@@ -115,6 +115,10 @@ fn words_are_checked_too() {
         ("delete sphere center=0,0,0", "sphere: missing field `radius`"),
         ("delete all sphere radius=1", "sphere: missing field `center`"),
         ("move by=1", "move: invalid type"),
+        (
+            &format!("delete all {}x=1", "a.".repeat(100_000)),
+            "all: unknown field `a`",
+        ),
         ("delete sphere center=0,0,0 radius=one", "edit"),
         ("delete sphere center=0,0,0 radius=1 radius=2", "given twice"),
         ("delete sphere center=0,0 radius=1", "invalid length"),

@@ -37,8 +37,7 @@ impl FromStr for Edit {
             match word.split_once('=') {
                 Some((key, text)) => {
                     let table = steps.last_mut().unwrap_or(&mut edit);
-                    insert(table, key, parse_value(text))
-                        .map_err(|why| EditError::Syntax(format!("{word}: {why}; a key is written KEY=VALUE")))?;
+                    insert(table, key, parse_value(text)).map_err(|why| EditError::Syntax(format!("{word}: {why}")))?;
                 }
                 None => {
                     let (mode, shape) = match word.split_at_checked(1) {
@@ -47,6 +46,10 @@ impl FromStr for Edit {
                         Some(("&", shape)) => ("intersect", shape),
                         _ => ("add", word),
                     };
+                    if !shape.starts_with(|c: char| c.is_ascii_alphabetic()) {
+                        let hint = "a key is written KEY=VALUE, without spaces, such as center=1,2,3";
+                        return Err(EditError::Syntax(format!("{word}: not a shape; {hint}")));
+                    }
                     let entries = [("mode", mode), ("shape", shape)];
                     steps.push(entries.into_iter().map(|(k, v)| (k.to_owned(), v.into())).collect());
                 }

@@ -116,6 +116,12 @@ fn words_are_checked_too() {
         ("delete all sphere radius=1", "sphere: missing field `center`"),
         ("move by=1", "move: invalid type"),
         (
+            "move by=1, 2, 3",
+            "2,: not a shape; a key is written KEY=VALUE, without spaces",
+        ),
+        ("delete - sphere center=0,0,0 radius=1", "-: not a shape"),
+        ("opacity 0.5", "0.5: not a shape"),
+        (
             &format!("delete all {}x=1", "a.".repeat(100_000)),
             "all: unknown field `a`",
         ),

@@ -8,10 +8,13 @@ use crate::photographs::photographs_of;
 use crate::scene_file::{check_not_overwritten, is_field, same_file};
 use crate::{RunError, RunFolder, SCENE, Scene, residual_left_out, scene_path, write_image};
 use irradia_edit::{Applied, Draft, Edit, EditList, Provenance, Transform, apply};
-use irradia_formats::{SplatFormat, WriteOptions, read_splat_file, write_atomic, write_splats, write_splats_with};
+use irradia_formats::{
+    SplatFile, SplatFormat, WriteOptions, read_splat_file, write_atomic, write_splats, write_splats_with,
+};
 use irradia_scene::GaussianCloud;
 use irradia_splat::Splats;
 use irradia_train::checkpoint::{splats_of, with_splats};
+use std::cell::RefCell;
 use std::fs;
 use std::io::ErrorKind;
 use std::iter;
@@ -30,7 +33,7 @@ pub struct Editing {
     /// How the whole scene was moved, in the dataset's coordinates.
     moved: Transform,
     splits: Vec<(String, GaussianCloud)>,
-    /// What was left out when the scene was read, a line each.
+    /// What was left out when the scene and those merged into it were read, and merged scenes that look different in it, a line each.
     pub notes: Vec<String>,
 }
 
@@ -95,13 +98,21 @@ impl Editing {
         list.check()?;
         for edit in &list.edits {
             let before = self.draft.len();
+            let antialiased = self.draft.cloud.antialiased;
+            let notes = RefCell::new(Vec::new());
+            let open = |file: &str| {
+                let other = open_scene(file, &self.path)?;
+                notes.borrow_mut().extend(merge_notes(file, &other, antialiased));
+                Ok(other.cloud)
+            };
             let Applied {
                 edit,
                 selected,
                 moved,
                 split,
                 ..
-            } = apply(&mut self.draft, edit, &|file| open_scene(file, &self.path))?;
+            } = apply(&mut self.draft, edit, &open)?;
+            self.notes.extend(notes.into_inner());
             if let Some(moved) = moved {
                 self.moved = self.moved.then(&moved);
             }
@@ -244,7 +255,8 @@ impl Editing {
         draft.photographs = self.draft.photographs.clone();
         let mut total = Provenance::identity(draft.len());
         for edit in &self.list.edits {
-            total = total.then(&apply(&mut draft, edit, &|file| open_scene(file, &self.path))?.provenance);
+            let open = |file: &str| Ok(open_scene(file, &self.path)?.cloud);
+            total = total.then(&apply(&mut draft, edit, &open)?.provenance);
         }
         draft.cloud.set_degree(degree);
         let source = |i: usize| total.source(i).filter(|_| !total.changed.contains(i));
@@ -312,12 +324,26 @@ impl Editing {
 }
 
 /// The scene `file`, looked up in the current folder, then beside the scene `path`.
-fn open_scene(file: &str, path: &Path) -> Result<GaussianCloud, String> {
+fn open_scene(file: &str, path: &Path) -> Result<SplatFile, String> {
     let here = Path::new(file);
     let path = if here.exists() {
         scene_path(here)
     } else {
         scene_path(&path.with_file_name(file))
     };
-    Ok(read_splat_file(&path).map_err(|error| error.to_string())?.cloud)
+    read_splat_file(&path).map_err(|error| error.to_string())
+}
+
+/// What was left out of the merged scene `file`, and whether its splats look different in a scene that is `antialiased` or not.
+fn merge_notes(file: &str, other: &SplatFile, antialiased: bool) -> Vec<String> {
+    let difference = match (other.cloud.antialiased, antialiased) {
+        (true, false) => Some("with Mip-Splatting's filter, this scene without: its smallest splats become too opaque"),
+        (false, true) => {
+            Some("without Mip-Splatting's filter, this scene with it: its smallest splats become too transparent")
+        }
+        _ => None,
+    };
+    let difference = difference.map(|difference| format!("trained {difference}"));
+    let notes = other.warnings().into_iter().chain(difference);
+    notes.map(|note| format!("{file}: {note}")).collect()
 }

@@ -87,7 +87,9 @@ pub fn run(args: &Args) -> Result<()> {
     if editing.draft().photographs.is_some() && list.edits.iter().any(finds_floaters) {
         note("floaters are judged by the photographs of the run, which takes a minute or more");
     }
+    let read = editing.notes.len();
     editing.apply(&list)?;
+    warn(&editing.notes[read..]);
     let mut notes = Vec::new();
     if let Some(out) = &args.out {
         let options = WriteOptions {

@@ -146,6 +146,33 @@ impl Observer for StopAt {
 }
 
 #[test]
+fn merged_scenes_that_look_different_are_reported() {
+    let folder = folder();
+    let [plain, filtered] = [false, true].map(|antialiased| {
+        let cloud = GaussianCloud {
+            means: vec![[0.0; 3]],
+            quats: vec![[1.0, 0.0, 0.0, 0.0]],
+            log_scales: vec![[-3.0; 3]],
+            opacity_logits: vec![1.0],
+            sh: vec![0.5; 3],
+            antialiased,
+            ..GaussianCloud::default()
+        };
+        let path = folder.path().join(format!("{antialiased}.ply"));
+        write_splats(&path, &cloud).expect("writes");
+        path
+    });
+    let notes = |scene: &Path, other: &Path| edited(scene, &[&format!("merge file={}", other.display())]).notes;
+    assert_eq!(notes(&plain, &plain), [""; 0]);
+    for (scene, other, words) in [
+        (&plain, &filtered, "true.ply: trained with Mip-Splatting's filter"),
+        (&filtered, &plain, "false.ply: trained without Mip-Splatting's filter"),
+    ] {
+        assert!(notes(scene, other).concat().contains(words), "{words}");
+    }
+}
+
+#[test]
 fn a_run_edited_in_place_resumes_with_the_edited_splats() {
     let folder = folder();
     let mut run = begin(folder.path(), "run", 12);

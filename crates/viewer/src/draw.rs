@@ -59,15 +59,24 @@ struct Drawing<'a> {
 }
 
 impl Drawing<'_> {
+    /// Reads the photograph of a view, and tells the page why it cannot be. Returns whether there is one.
+    fn read_photo(&mut self, client: u64, view: Option<usize>) -> bool {
+        let read = view.map_or(Ok(false), |view| self.painter.read_photo(view));
+        read.unwrap_or_else(|error| {
+            let message = json!({ "tell": "problem", "text": error.to_string() });
+            self.scheduler.send_text(client, message.to_string());
+            false
+        })
+    }
+
     fn draw_picture(&mut self, edition: &Edition, client: u64, shot: &Shot, detail: Detail) {
         let (subject, scheduler) = (self.subject, self.scheduler);
         let opened = Instant::now();
         self.painter.prepare(edition, shot, &detail);
         // Work that is done once per version is not part of a picture's cost.
         let started = Instant::now();
-        let view = shot.view.and_then(|view| subject.views.0.get(view));
         let mut shot_drawn = *shot;
-        if shot.mode == Mode::Error && view.is_none_or(|view| view.photo.is_none()) {
+        if shot.mode == Mode::Error && !self.read_photo(client, shot.view) {
             // Without a photograph there are no errors: colours are drawn instead.
             shot_drawn.mode = Mode::Color;
         }

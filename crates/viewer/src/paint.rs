@@ -10,14 +10,13 @@ use crate::views::Views;
 use glam::{Vec2, Vec3};
 use irradia_field::{Field, render_view};
 use irradia_runs::psnr_8_bits;
-use irradia_scene::{Camera, Intrinsics, Photo, sh};
+use irradia_scene::{Camera, Intrinsics, LoadError, Photo, sh};
 use irradia_splat::render::Shape;
 use irradia_splat::{RenderOptions, Renderer, Splats};
 use irradia_train::lights::Light;
 use irradia_train::model::{Model, render_splats};
 use rayon::prelude::*;
 use std::borrow::Cow;
-use std::sync::Arc;
 
 /// Rows of a field that are drawn between two checks whether the picture is still wanted.
 const STRIP_ROWS: u32 = 32;
@@ -54,8 +53,8 @@ pub(crate) struct Painter<'a> {
     important: Option<ImportantSplats>,
     /// Splats that differ from the scene's: clipped, selected, or coloured by their normals.
     altered: Option<(Alteration, Splats)>,
-    /// The last photograph that was read, by its view.
-    photo: Option<(usize, Arc<Photo>)>,
+    /// The last photograph that was read, by its view; `None` if it cannot be.
+    photo: Option<(usize, Option<Photo>)>,
 }
 
 struct ImportantSplats {
@@ -133,7 +132,7 @@ impl<'a> Painter<'a> {
         });
     }
 
-    /// Draws `shot` in this detail, after [`Self::prepare`]; `None` if it is no longer wanted, or its photograph cannot be read.
+    /// Draws `shot` in this detail, after [`Self::prepare`]; `None` if it is no longer wanted, or its photograph has not been read.
     pub fn paint(
         &mut self,
         edition: &Edition,
@@ -270,7 +269,7 @@ impl<'a> Painter<'a> {
     }
 
     fn planes_picture(
-        &mut self,
+        &self,
         shot: &Shot,
         planes: &Planes,
         background: [f32; 3],
@@ -283,7 +282,8 @@ impl<'a> Painter<'a> {
                 (grey.flatten().collect(), Some([0.0, 1.0]))
             }
             Mode::Error => {
-                let photo = self.photo(shot.view?)?;
+                let (view, photo) = self.photo.as_ref()?;
+                let photo = photo.as_ref().filter(|_| Some(*view) == shot.view)?;
                 let truth = photo.resized(width, height).over(background);
                 error_picture(&planes.color, &truth)
             }
@@ -292,15 +292,22 @@ impl<'a> Painter<'a> {
         })
     }
 
-    /// The photograph of view `index`, if there is one.
-    fn photo(&mut self, index: usize) -> Option<Arc<Photo>> {
+    /// Reads the photograph of view `index`, which pictures of errors need. Returns whether there is one.
+    ///
+    /// # Errors
+    /// When it cannot be read; for the same view, once.
+    pub fn read_photo(&mut self, index: usize) -> Result<bool, LoadError> {
         if let Some((_, photo)) = self.photo.as_ref().filter(|(kept, _)| *kept == index) {
-            return Some(photo.clone());
+            return Ok(photo.is_some());
         }
-        let source = self.views.0.get(index)?.photo.as_ref()?;
-        let photo = Arc::new(source.load().ok()?);
-        self.photo = Some((index, photo.clone()));
-        Some(photo)
+        let source = self.views.0.get(index).and_then(|view| view.photo.as_ref());
+        let (photo, outcome) = match source.map(|source| source.load()) {
+            Some(Ok(photo)) => (Some(photo), Ok(true)),
+            Some(Err(error)) => (None, Err(error)),
+            None => (None, Ok(false)),
+        };
+        self.photo = Some((index, photo));
+        outcome
     }
 
     /// PSNR of the scene against the photograph of view `index`, in that one's light, dB; `None` without a photograph.

@@ -3,4 +3,5 @@
 mod client;
 mod editing;
 mod live;
+mod pictures;
 mod security;

@@ -1,11 +1,14 @@
 //! A page, simulated by bytes on a socket.
 
-use std::io::{Read, Write};
+use std::io::{ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::time::Duration;
 
 /// A picture of what is around the origin.
 pub const SHOT: &str = r#"{"do":"shot","id":1,"position":[0,0,-4],"rotation":[1,0,0,0],"width":64,"height":48,"fx":50,"fy":50,"cx":32,"cy":24}"#;
+
+/// More bytes than any request may have.
+pub const TOO_LARGE: usize = (16 << 20) + 1;
 
 /// A connection to the server.
 pub fn connect(address: SocketAddr) -> TcpStream {
@@ -68,22 +71,32 @@ impl Socket {
     /// The next message; `None` when the connection has ended.
     pub fn receive(&mut self) -> Option<(u8, Vec<u8>)> {
         let mut head = [0; 2];
-        self.0.read_exact(&mut head).ok()?;
+        self.read(&mut head)?;
         let mut long = [0; 8];
         let len = match head[1] & 0x7f {
             126 => {
-                self.0.read_exact(&mut long[6..]).ok()?;
+                self.read(&mut long[6..])?;
                 u64::from_be_bytes(long)
             }
             127 => {
-                self.0.read_exact(&mut long).ok()?;
+                self.read(&mut long)?;
                 u64::from_be_bytes(long)
             }
             len => u64::from(len),
         };
         let mut payload = vec![0; len as usize];
-        self.0.read_exact(&mut payload).ok()?;
+        self.read(&mut payload)?;
         Some((head[0] & 0xf, payload))
+    }
+
+    fn read(&mut self, to: &mut [u8]) -> Option<()> {
+        match self.0.read_exact(to) {
+            Ok(()) => Some(()),
+            Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => {
+                panic!("the server neither answers nor ends the connection")
+            }
+            Err(_) => None,
+        }
     }
 
     /// Whether the server ends the connection.

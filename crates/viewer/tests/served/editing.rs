@@ -1,6 +1,6 @@
 //! Editing by pages: which requests are carried out, and which are refused.
 
-use crate::client::Socket;
+use crate::client::{Socket, TOO_LARGE};
 use crate::security::{Served, serve};
 use irradia_runs::Editing;
 use irradia_runs::formats::{SplatFormat, encode_splats, read_splats};
@@ -171,7 +171,7 @@ fn hostile_requests_are_refused_in_one_line_and_change_nothing() {
     }
     let editing = request_state(&mut page, &select_right_splat(), ("selected", json!(1)));
     assert_eq!((&editing["total"], &editing["of"]), (&json!(1), &json!(3)));
-    page.send(1, lasso(20_000).to_string().as_bytes());
+    page.send(1, &vec![b' '; TOO_LARGE]);
     assert!(page.is_ended(), "larger than any request");
     served.assert_draws();
 }

@@ -1,6 +1,6 @@
 //! Hostile clients: refused, reported once, and without effect on others.
 
-use crate::client::{SHOT, Socket, address_of, connect};
+use crate::client::{SHOT, Socket, TOO_LARGE, address_of, connect};
 use irradia_runs::formats::write_splats;
 use irradia_scene::GaussianCloud;
 use irradia_viewer::{Listen, Subject, Viewer};
@@ -232,7 +232,7 @@ fn beyond_loopback_the_token_is_needed() {
 fn garbage_and_giants_end_their_own_connection_only() {
     let served = serve("127.0.0.1");
     let mut giant = served.socket();
-    giant.send(1, &vec![b' '; 1 << 20]);
+    giant.send(1, &vec![b' '; TOO_LARGE]);
     assert!(giant.is_ended(), "an oversized frame");
 
     let mut liar = served.socket();

@@ -5,6 +5,7 @@ use crate::message::Request;
 use crate::scheduler::{MAX_CLIENTS, OutMessage, Task};
 use crate::serve::{Shared, downloads};
 use crate::subject::Edition;
+use axum::body::Bytes;
 use axum::extract::ws::{CloseFrame, Message, WebSocket};
 use irradia_edit::Transform;
 use irradia_train::model::Model;
@@ -12,7 +13,7 @@ use serde_json::{Value, json};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tokio::sync::{mpsc, watch};
-use tokio::time::{MissedTickBehavior, interval, timeout};
+use tokio::time::{Interval, MissedTickBehavior, interval_at, timeout};
 
 /// Maximum number of messages that wait for a page.
 const OUTBOX_CAPACITY: usize = 8;
@@ -24,6 +25,8 @@ const MAX_FAULTS: u32 = 200;
 const SEND_TIMEOUT: Duration = Duration::from_secs(20);
 /// Interval of news about a training.
 const NEWS_INTERVAL: Duration = Duration::from_millis(250);
+/// Interval of pings. A page from which nothing came since the last one is gone: machines fall asleep without closing their connections.
+const PING_INTERVAL: Duration = Duration::from_secs(30);
 
 /// Disconnects the client however the task ends.
 struct ClientGuard {
@@ -65,14 +68,14 @@ pub(crate) async fn serve(mut socket: WebSocket, shared: Arc<Shared>) {
     if let Some(live) = &shared.subject.live {
         live.page_opened();
     }
-    let mut cursor = ReportCursor::default();
-    let (mut version, mut reported) = (0, Value::Null);
-    let mut news = interval(NEWS_INTERVAL);
-    news.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut told = Told::default();
+    let (mut news, mut pings) = (every(NEWS_INTERVAL), every(PING_INTERVAL));
+    let mut is_there = true;
     let mut edits = shared.subject.editing.as_ref().ok().map(|editing| editing.watch());
     let mut limiter = RateLimiter::new();
-    let greeting = hello(&shared, changed_scene(&shared, &mut version)).to_string();
-    if !send(&mut socket, Message::text(greeting)).await {
+    let greeting = hello(&shared, told.changed_scene(&shared));
+    let messages = [Some(greeting), told.new_report(&shared)];
+    if !send_all(&mut socket, texts(messages.iter().flatten())).await {
         return;
     }
     if let Some(edits) = &mut edits {
@@ -82,7 +85,7 @@ pub(crate) async fn serve(mut socket: WebSocket, shared: Arc<Shared>) {
         tokio::select! {
             message = socket.recv() => match message {
                 Some(Ok(message)) => match handle(&shared, client, message, &mut limiter) {
-                    Outcome::Continue => {}
+                    Outcome::Continue => is_there = true,
                     Outcome::Closed => return,
                     Outcome::Rejected(why) => {
                         shared.notices.report_once(why, format_args!("a page was disconnected: {why}"));
@@ -108,30 +111,31 @@ pub(crate) async fn serve(mut socket: WebSocket, shared: Arc<Shared>) {
             }
             Some(state) = next_edit_state(&mut edits) => {
                 // The scene first: the selection is one of its splats.
-                for text in changed_scene(&shared, &mut version).iter().chain([&*state]) {
-                    if !send(&mut socket, Message::text(text.to_string())).await {
-                        return;
-                    }
+                let messages = texts(told.changed_scene(&shared).iter().chain([&*state]));
+                if !send_all(&mut socket, messages).await {
+                    return;
                 }
             }
             _ = news.tick() => {
-                let mut messages = Vec::new();
-                if let Some(live) = &shared.subject.live {
-                    let report = live.report(&mut cursor);
-                    if report != reported {
-                        messages.push(report.clone());
-                        reported = report;
-                    }
+                let messages = [told.new_report(&shared), told.changed_scene(&shared)];
+                if !send_all(&mut socket, texts(messages.iter().flatten())).await {
+                    return;
                 }
-                messages.extend(changed_scene(&shared, &mut version));
-                for text in messages {
-                    if !send(&mut socket, Message::text(text.to_string())).await {
-                        return;
-                    }
+            }
+            _ = pings.tick() => {
+                if !std::mem::take(&mut is_there) || !send(&mut socket, Message::Ping(Bytes::new())).await {
+                    return;
                 }
             }
         }
     }
+}
+
+/// Ticks after each `period`, which begins anew if a tick is late.
+fn every(period: Duration) -> Interval {
+    let mut ticks = interval_at(tokio::time::Instant::now() + period, period);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    ticks
 }
 
 /// Waits for the next state of the editing session; for ever if there is none.
@@ -144,19 +148,54 @@ async fn next_edit_state(edits: &mut Option<watch::Receiver<Arc<Value>>>) -> Opt
     std::future::pending().await
 }
 
-/// The scene, if its splats are not those of `version`, which is updated.
-fn changed_scene(shared: &Shared, version: &mut u64) -> Option<Value> {
-    let edition = shared.subject.edition()?;
-    if edition.splats_version == *version {
-        return None;
+/// What a page has been told.
+#[derive(Default)]
+struct Told {
+    /// Version of the scene's splats.
+    version: u64,
+    cursor: ReportCursor,
+    report: Value,
+}
+
+impl Told {
+    /// The scene, if its splats are not those that the page knows.
+    fn changed_scene(&mut self, shared: &Shared) -> Option<Value> {
+        let edition = shared.subject.edition()?;
+        if edition.splats_version == self.version {
+            return None;
+        }
+        self.version = edition.splats_version;
+        Some(scene(&edition))
     }
-    *version = edition.splats_version;
-    Some(scene(&edition))
+
+    /// The state of the training, if it has changed.
+    fn new_report(&mut self, shared: &Shared) -> Option<Value> {
+        let report = shared.subject.live.as_ref()?.report(&mut self.cursor);
+        if report == self.report {
+            return None;
+        }
+        self.report = report.clone();
+        Some(report)
+    }
 }
 
 /// Sends `message`; returns whether the page accepted it in time.
 async fn send(socket: &mut WebSocket, message: Message) -> bool {
     matches!(timeout(SEND_TIMEOUT, socket.send(message)).await, Ok(Ok(())))
+}
+
+fn texts<'v>(values: impl Iterator<Item = &'v Value>) -> Vec<String> {
+    values.map(Value::to_string).collect()
+}
+
+/// Sends `messages` one after another, as long as the page accepts them in time.
+async fn send_all(socket: &mut WebSocket, messages: Vec<String>) -> bool {
+    for message in messages {
+        if !send(socket, Message::text(message)).await {
+            return false;
+        }
+    }
+    true
 }
 
 enum Outcome {

@@ -175,7 +175,14 @@ for (const [name, make] of [["a trained scene", trained], ["random splats", () =
     await set(page, { mode: "color" });
     await sharp(page);
     assert.equal((await painter(page)).api, "WebGPU");
-    await page.evaluate(() => document.querySelector("irr-stage").local.gpu.gpu.device.destroy());
+    // A frame that fails after its device was lost.
+    await page.evaluate(async () => {
+      const { local } = document.querySelector("irr-stage");
+      const { gpu } = local;
+      gpu.gpu.device.destroy();
+      await gpu.gpu.device.lost;
+      local.giveUp(gpu, new Error("late"));
+    });
     await until(page, () => document.querySelector("irr-stage").local.api === "WebGL2");
     await compare(35, "WebGL2");
     assert.match((await painter(page)).text, /the GPU was lost/);
@@ -207,6 +214,19 @@ for (const [name, before, reason] of /** @type {const} */ ([
     await server.stop();
   });
 }
+
+test("where WebGL2 has no shaders the server draws", async () => {
+  const server = await serve("view", random(500), "--port", "0");
+  const { page } = await open(drawing, server.address, { ...SMALL, before: () => {
+    WebGL2RenderingContext.prototype.getShaderParameter = () => false;
+    WebGL2RenderingContext.prototype.getShaderInfoLog = () => "refused";
+  } });
+  await set(page, { drawing: "local" });
+  await until(page, () => !document.querySelector("irr-stage").drawsLocally);
+  await sharp(page);
+  await page.getByText("refused").waitFor();
+  await server.stop();
+});
 
 test("the page and the program agree about camera paths", async () => {
   const server = await serve("view", trained(), "--port", "0");

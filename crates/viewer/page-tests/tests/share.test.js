@@ -97,6 +97,21 @@ test("a page from a file draws with WebGPU where there is a GPU", async () => {
   await by.close();
 });
 
+test("a page draws again after its GPU was lost", async () => {
+  const html = join(scratch, "lost.html");
+  run("share", random(4000), "-o", html);
+  const { page, problems } = await open(pathToFileURL(html).href, { offline: true });
+  const before = await shown(page);
+  await page.evaluate(() => {
+    const { renderer } = /** @type {any} */ (window).irradia;
+    renderer.webGl.gl.getExtension("WEBGL_lose_context").loseContext();
+    return new Promise((resolve) => (renderer.webGl.canvas.addEventListener("webglcontextlost", () => setTimeout(resolve))));
+  });
+  await settled(page, problems);
+  assert.ok(psnr(before, await shown(page)) > 50);
+  assert.deepEqual(problems, []);
+});
+
 test("a page that is too large loses harmonics, then splats, and says so", async () => {
   const html = join(scratch, "small.html");
   const said = run("share", random(4000), "-o", html, "--max", "150kB");

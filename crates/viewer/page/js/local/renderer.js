@@ -24,6 +24,8 @@ const FRAME_BUDGET = 33;
 const MAX_WAIT = 1500;
 /** Milliseconds until a selection that came before its splats is requested again. */
 const RETRY_DELAY = 100;
+/** Milliseconds within which a second loss of WebGL2 means that the GPU cannot draw the scene. */
+const MIN_LIFE = 30000;
 
 export class LocalRenderer {
   /** The current painter; null before the first one is open, and if there is none. @type {WebGpu | WebGl | null} */
@@ -32,6 +34,8 @@ export class LocalRenderer {
   gpu = null;
   /** Undefined until it is needed; null if it cannot paint. @type {WebGl | null | undefined} */
   webGl = undefined;
+  /** When WebGL2 was lost, milliseconds. */
+  lostAt = -Infinity;
   /** Why WebGPU does not paint; empty if it does. */
   reason = "";
   opened = false;
@@ -93,8 +97,17 @@ export class LocalRenderer {
   }
 
   openWebGl() {
-    if (this.webGl === undefined) this.webGl = WebGl.open(() => this.change(), () => this.giveUp(this.webGl ?? null, "the GPU was lost"));
+    if (this.webGl === undefined) this.webGl = WebGl.open(() => this.change(), (lost) => this.reopen(lost));
     return this.webGl;
+  }
+
+  /** Opens WebGL2 anew when its context is lost, as on telephones while the page is in the background. @param {WebGl} lost */
+  reopen(lost) {
+    const now = performance.now();
+    if (now < this.lostAt + MIN_LIFE) return this.giveUp(lost, "the GPU was lost");
+    this.lostAt = now;
+    if (this.webGl === lost) this.webGl = undefined;
+    if (this.painter === lost) this.use(this.painterOf(this.wanted?.shot.mode));
   }
 
   /** Whether it can paint at all; false until a painter is open. */
@@ -163,7 +176,8 @@ export class LocalRenderer {
     lost.gpu.device.destroy();
   }
 
-  /** Stops using a painter that fails. @param {WebGpu | WebGl | null} painter @param {unknown} error */
+  /** Stops using a painter that fails, unless it is out of use already: a frame fails after its device is lost.
+   * @param {WebGpu | WebGl | null} painter @param {unknown} error */
   giveUp(painter, error) {
     if (painter === null || painter === this.gpu) return this.withoutGpu(message(error));
     this.webGl = null;
@@ -208,7 +222,7 @@ export class LocalRenderer {
     this.abort = abort;
     this.streaming = true;
     try {
-      await painter.ready;
+      await painter.ready.catch((error) => this.giveUp(painter, error));
       const response = await openSplats(abort.signal);
       await readSplats(response, (header) => abort.signal.aborted || this.begin(painter, header), (block) => abort.signal.aborted || this.take(painter, block));
       if (!abort.signal.aborted) this.streaming = false;

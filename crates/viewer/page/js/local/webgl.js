@@ -34,8 +34,8 @@ export class WebGl {
   asked = null;
 
   /** @param {WebGL2RenderingContext} gl @param {() => void} changed called when a new picture would differ from the last
-   * @param {(reason: string) => void} fail called when the context is lost */
-  constructor(gl, changed, fail) {
+   * @param {(lost: WebGl) => void} lose called when the context is lost */
+  constructor(gl, changed, lose) {
     this.gl = gl;
     this.canvas = /** @type {HTMLCanvasElement} */ (gl.canvas);
     this.changed = changed;
@@ -45,14 +45,17 @@ export class WebGl {
     this.worker = orderWorker();
     this.worker.onmessage = ({ data }) => this.ordered(data);
     this.ready = this.prepare(gl);
-    this.canvas.addEventListener("webglcontextlost", () => fail("the GPU was lost"));
+    this.canvas.addEventListener("webglcontextlost", () => {
+      this.worker.terminate();
+      lose(this);
+    });
   }
 
-  /** Null if the browser has no WebGL2. @param {() => void} changed @param {(reason: string) => void} fail */
-  static open(changed, fail) {
+  /** Null if the browser has no WebGL2. @param {() => void} changed @param {(lost: WebGl) => void} lose */
+  static open(changed, lose) {
     const options = { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true, powerPreference: "high-performance" };
     const gl = /** @type {WebGL2RenderingContext | null} */ (document.createElement("canvas").getContext("webgl2", options));
-    return gl && new WebGl(gl, changed, fail);
+    return gl && new WebGl(gl, changed, lose);
   }
 
   /** @param {WebGL2RenderingContext} gl */

@@ -80,6 +80,21 @@ test("a session begins where one is offered, and both eyes see the scene", async
   await server.stop();
 });
 
+test("a headset gets the splats of a page that the server draws", async () => {
+  const server = await serve("view", trained(), "--port", "0");
+  const page = await (await browser.newContext({ viewport: { width: 900, height: 500 } })).newPage();
+  await page.addInitScript(headset);
+  await page.goto(server.address);
+  await set(page, { drawing: "served" });
+  await sharp(page);
+  await page.getByRole("button", { name: "VR" }).click();
+  await until(page, () => {
+    const { loaded, total } = document.querySelector("irr-stage").local;
+    return total > 0 && loaded === total;
+  }, null, 30);
+  await server.stop();
+});
+
 test("there is no button where none is offered", async () => {
   const server = await serve("view", trained(), "--port", "0");
   const page = await (await browser.newContext()).newPage();

@@ -387,6 +387,7 @@ export class LocalRenderer {
     this.aim();
     this.webGl?.eye(to, port, camera, this.k, this.options({}, false));
   }
+    if (this.webGl && this.scene) this.fetch(this.webGl, this.scene);
 }
 
 /** @param {Intrinsics} k @param {number} share of its sides @returns {Intrinsics} */

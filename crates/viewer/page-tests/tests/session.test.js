@@ -253,6 +253,23 @@ test("a page that draws itself keeps its splats while the connection is broken, 
   await local.close();
 });
 
+test("where too many pages are open, a page says so and tries again less and less often", async () => {
+  const server = await serve("view", trained(), "--port", "0");
+  const page = await (await browser.newContext()).newPage();
+  let tries = 0;
+  await page.routeWebSocket(/socket/, (socket) => {
+    tries += 1;
+    setTimeout(() => socket.close({ code: 1013, reason: "there are too many pages" }), 50);
+  });
+  await page.goto(server.address);
+  await page.getByText("Too many pages").waitFor();
+  tries = 0;
+  await page.waitForTimeout(3000);
+  assert.ok(tries <= 4, `${tries} tries`);
+  assert.ok(await page.getByText("Too many pages").isVisible());
+  await server.stop();
+});
+
 test("an address holds the camera", async () => {
   const server = await serve("view", trained(), "--port", "0");
   const { page } = await open(browser, server.address, { width: 500, height: 400 });

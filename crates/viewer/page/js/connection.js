@@ -21,11 +21,6 @@ class Connection extends EventTarget {
     const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/socket${location.search}`);
     socket.binaryType = "arraybuffer";
     socket.onmessage = (event) => this.receive(event.data);
-    socket.onopen = () => {
-      this.wait = MIN_WAIT;
-      state.set({ connection: "open" });
-      this.dispatchEvent(new Event("open"));
-    };
     socket.onclose = (event) => {
       this.socket = null;
       const full = event.code === 1013;
@@ -67,8 +62,14 @@ class Connection extends EventTarget {
       case "hello":
         // Another server at the same address may have another scene.
         if ((state.get("hello")?.id ?? told.id) !== told.id) return location.reload();
+        // Not before the greeting: a server with too many pages accepts a socket only to close it.
+        this.wait = MIN_WAIT;
         // A scale that the server cannot keep stays.
-        state.set({ hello: told, views: told.views, metres: told.metres ?? state.get("metres"), ...(told.scene && { scene: told.scene }) });
+        state.set({
+          connection: "open", hello: told, views: told.views, metres: told.metres ?? state.get("metres"),
+          ...(told.scene && { scene: told.scene }),
+        });
+        this.dispatchEvent(new Event("open"));
         break;
       case "scene":
         state.set({ scene: told });

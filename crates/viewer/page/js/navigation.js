@@ -1,6 +1,5 @@
 // Orbit, fly and walk with mouse, touch, trackpad and keyboard.
 
-import { connection } from "./connection.js";
 import { forward } from "./camera.js";
 import { add, axes, clamp, cross, dot, length, lookAt, mix, multiply, normalize, rotate, scale, slerp, subtract, turn, unit } from "./math.js";
 import { isEditTool } from "./edit/tools.js";
@@ -282,6 +281,3 @@ export function homeOf() {
   const position = add(pivot, add(scale(flat, radius), scale(up, scene?.height ?? 1)));
   return { camera: { position, rotation: lookAt(position, pivot, up), fov }, pivot };
 }
-
-// After a reconnection, the page sends its request again.
-connection.addEventListener("open", () => state.dispatchEvent(new Event("camera")));

@@ -228,6 +228,25 @@ test("where WebGL2 has no shaders the server draws", async () => {
   await server.stop();
 });
 
+test("a comparison ends where its view is left", async () => {
+  const server = await serve("view", trained(), "--port", "0");
+  const { page, problems } = await open(drawing, server.address, SMALL);
+  const shown = () => page.evaluate(async () => {
+    const { frustumAt } = await import("/page/js/overlay.js");
+    const stage = document.querySelector("irr-stage");
+    const { camera, k } = stage.wanted;
+    return { local: stage.drawsLocally, cameras: frustumAt(camera, k, 0, 0, Infinity) !== null };
+  });
+  await set(page, { drawing: "local", frusta: true });
+  assert.deepEqual(await shown(), { local: true, cameras: true });
+  await set(page, { view: 3, compare: "error" });
+  assert.deepEqual(await shown(), { local: false, cameras: false });
+  await set(page, { view: null });
+  assert.deepEqual(await shown(), { local: true, cameras: true });
+  assert.deepEqual(problems, []);
+  await server.stop();
+});
+
 test("the page and the program agree about camera paths", async () => {
   const server = await serve("view", trained(), "--port", "0");
   const { page } = await open(browser, server.address, { width: 300, height: 200 });

@@ -93,7 +93,7 @@ class Hud extends HTMLElement {
 /** @param {import("./connection.js").Header | null | undefined} header */
 function legendOf(header) {
   if (!header?.range) return [];
-  const error = state.get("compare") === "error" && state.get("view") !== null;
+  const error = state.comparison === "error";
   const mode = error ? "error" : state.get("mode");
   const name = error ? "Mean error" : (MODES.find(([value]) => value === mode)?.[1] ?? "");
   const [low, high] = header.range;

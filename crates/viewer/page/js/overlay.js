@@ -57,7 +57,7 @@ export function drawOverlay(context, camera, k, pixel) {
 /** Cameras that are drawn: not those near the current one, which would only cover the picture; none while comparing with a photograph.
  * @param {Camera} camera */
 function seenFrusta(camera) {
-  if (!state.get("frusta") || state.get("compare") !== "none") return [];
+  if (!state.get("frusta") || state.comparison !== "none") return [];
   const near = 1.5 * FRUSTUM_SIZE * (state.get("scene")?.radius ?? 1);
   const all = state.get("views").map((view, index) => ({ view, index, apart: length(subtract(view.position, camera.position)) }));
   return all.filter(({ apart }) => apart > near).sort((a, b) => b.apart - a.apart);

@@ -122,7 +122,7 @@ export class Stage extends HTMLElement {
   /** Whether this page draws locally. */
   get drawsLocally() {
     const scene = state.get("scene");
-    if (!scene?.travels || !LOCAL_MODES.includes(state.get("mode")) || state.get("compare") === "error") return false;
+    if (!scene?.travels || !LOCAL_MODES.includes(state.get("mode")) || state.comparison === "error") return false;
     if (!this.local?.paints(state.get("mode")) || this.light !== null) return false;
     const drawing = state.get("drawing");
     if (drawing !== "auto") return drawing === "local";
@@ -132,7 +132,7 @@ export class Stage extends HTMLElement {
   /** The view in whose light the scene is shown: that of the photograph it is compared with, if any. @returns {number | null} */
   get light() {
     if (!state.get("scene")?.lights) return null;
-    const compares = state.get("compare") !== "none" && state.insideView?.trained;
+    const compares = state.comparison !== "none" && state.insideView?.trained;
     return compares ? state.get("view") : state.get("light");
   }
 
@@ -149,11 +149,10 @@ export class Stage extends HTMLElement {
     const density = Math.min(this.density ?? 1, MAX_SIDE / Math.max(rect.width, rect.height, 1));
     const [width, height] = [Math.max(1, Math.round(rect.width * density)), Math.max(1, Math.round(rect.height * density))];
     const k = intrinsics(width, height, camera.fov, state.insideView);
-    const error = state.get("compare") === "error" && state.get("view") !== null;
     const background = state.get("background");
     return {
       id: this.ids, position: camera.position, rotation: camera.rotation, ...k,
-      mode: error ? "error" : state.get("mode"),
+      mode: state.comparison === "error" ? "error" : state.get("mode"),
       view: state.get("view"),
       background: background && rgb(background),
       clip: state.get("clip"),
@@ -313,9 +312,8 @@ export class Stage extends HTMLElement {
 
   showPhoto() {
     const index = state.get("view");
-    const view = state.insideView;
-    const compare = state.get("compare");
-    const shows = Boolean(view?.photo) && (compare === "slider" || compare === "blink");
+    const compare = state.comparison;
+    const shows = compare === "slider" || compare === "blink";
     if (!this.photo || !this.handle) return;
     this.stale = true;
     this.photo.hidden = !shows;

@@ -107,6 +107,11 @@ class State extends EventTarget {
     const index = this.values.view;
     return index === null ? null : (this.values.views[index] ?? null);
   }
+
+  /** How the picture is compared now: `compare` is kept for the next view with a photograph. @returns {Values["compare"]} */
+  get comparison() {
+    return this.insideView?.photo ? this.values.compare : "none";
+  }
 }
 
 export const state = new State();

@@ -25,10 +25,13 @@ renderer.ready.then(() => {
 // For tests, and for pages that embed this one.
 Object.assign(window, { irradia: { renderer, camera: () => camera, set: (to) => ((camera = to), (stale = true)) } });
 
+const density = () => Math.min(devicePixelRatio || 1, MAX_DENSITY);
+/** With which the last picture was drawn. */
+let drawn = density();
+
 /** Pixels and focal length: the picture shows at least as much in width and height as at the start. */
 function intrinsics() {
-  const density = Math.min(devicePixelRatio || 1, MAX_DENSITY);
-  const [width, height] = [Math.max(1, Math.round(stage.clientWidth * density)), Math.max(1, Math.round(stage.clientHeight * density))];
+  const [width, height] = [stage.clientWidth, stage.clientHeight].map((side) => Math.max(1, Math.round(side * density())));
   const vertical = height / 2 / Math.tan(camera.fov / 2);
   const focal = Math.min(vertical, (vertical * width) / height / view.aspect);
   return { width, height, fx: focal, fy: focal, cx: width / 2, cy: height / 2 };
@@ -52,7 +55,7 @@ function orbit(dx, dy) {
 /** Moves camera and pivot across the view. @param {number} dx @param {number} dy pixels */
 function pan(dx, dy) {
   const [right, down] = axes(camera.rotation);
-  const step = reach() / intrinsics().fy * Math.min(devicePixelRatio || 1, MAX_DENSITY);
+  const step = reach() / intrinsics().fy * density();
   const move = add(scale(right, -dx * step), scale(down, -dy * step));
   pivot = add(pivot, move);
   camera = { ...camera, position: add(camera.position, move) };
@@ -158,8 +161,8 @@ function frame(now) {
     [camera, stale] = [along(seconds), true];
     if (seconds >= (view.path.keys.length - 1) * view.path.step) fly(null);
   }
-  if (stale) {
-    stale = false;
+  if (stale || drawn !== density()) {
+    [stale, drawn] = [false, density()];
     renderer.want(camera, intrinsics(), {});
   }
   if (renderer.draw(now) && renderer.drawn > 0) {

@@ -270,6 +270,20 @@ test("where too many pages are open, a page says so and tries again less and les
   await server.stop();
 });
 
+test("on a screen of another density the picture has its pixels", async () => {
+  const server = await serve("view", trained(), "--port", "0");
+  const { page, context } = await open(browser, server.address, { width: 500, height: 400 });
+  await set(page, { drawing: "served" });
+  const session = await context.newCDPSession(page);
+  await session.send("Emulation.setDeviceMetricsOverride", { width: 500, height: 400, deviceScaleFactor: 2, mobile: false });
+  await until(page, () => devicePixelRatio === 2);
+  await until(page, () => {
+    const stage = document.querySelector("irr-stage");
+    return stage.served.width === 2 * stage.clientWidth && stage.overlay.width === 2 * stage.clientWidth;
+  });
+  await server.stop();
+});
+
 test("an address holds the camera", async () => {
   const server = await serve("view", trained(), "--port", "0");
   const { page } = await open(browser, server.address, { width: 500, height: 400 });

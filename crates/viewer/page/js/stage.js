@@ -111,7 +111,7 @@ export class Stage extends HTMLElement {
   }
 
   resize() {
-    this.density = Math.min(devicePixelRatio || 1, MAX_DENSITY);
+    this.density = densityNow();
     if (this.overlay) {
       this.overlay.width = Math.round(this.clientWidth * this.density);
       this.overlay.height = Math.round(this.clientHeight * this.density);
@@ -182,6 +182,8 @@ export class Stage extends HTMLElement {
   /** @param {number} now */
   frame(now) {
     this.navigation?.tick(now);
+    // On a screen of another density, the stage may have the same size.
+    if (densityNow() !== this.density) this.resize();
     if (!this.served || !this.drawn || !this.local) return;
     const local = this.drawsLocally;
     if (this.dirty) {
@@ -357,6 +359,9 @@ export class Stage extends HTMLElement {
     this.clipPhoto();
   }
 }
+
+/** Device pixels per CSS pixel. */
+const densityNow = () => Math.min(devicePixelRatio || 1, MAX_DENSITY);
 
 /** @param {string} hex @returns {[number, number, number]} */
 export function rgb(hex) {

@@ -307,6 +307,12 @@ test("every screen at 1440, 768 and 360 pixels", async () => {
   const server = await serve("view", process.env.SCREENS_OF ?? trained(), "--port", "0");
   for (const [width, height] of [[1440, 900], [768, 1024], [360, 740]]) {
     for (const theme of ["dark", "light"]) {
+  assert.equal(await get(other.page, "view"), null, "it is in no view");
+  // In the same tab, with a mode and a view that do not exist.
+  await page.evaluate(() => (location.hash = `${location.hash.replace(/f=[^&]*/, "f=0.5")}&m=nonsense&v=999`));
+  await until(page, async () => (await import("/page/js/state.js")).state.get("camera").fov === 0.5);
+  await sharp(page);
+  assert.deepEqual([await get(page, "mode"), await get(page, "view")], ["color", null]);
       const { page, problems } = await open(browser, server.address, { width, height, theme });
       await set(page, { drawing: "served" });
       const shoot = async (name) => {

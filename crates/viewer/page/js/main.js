@@ -38,4 +38,7 @@ state.watch(["scene", "views"], () => {
   state.set({ up: scene.up, camera, pivot, ...(empty && { frusta: true }), ...sharedValues() });
 });
 
+// Another address of the same page does not load it again.
+addEventListener("hashchange", () => placed && state.set({ ...sharedValues() }));
+
 connection.open();

@@ -1,5 +1,6 @@
 // The camera in the page's address: everything after the # sign.
 
+import { MODES } from "./commands.js";
 import { unit } from "./math.js";
 import { state } from "./state.js";
 
@@ -20,13 +21,15 @@ export function shareAddress() {
 export function sharedValues() {
   const given = new URLSearchParams(location.hash.slice(1));
   const numbers = (/** @type {string} */ name, /** @type {number} */ count) => {
-    const values = (given.get(name) ?? "").split(",").map(Number);
+    const values = (given.get(name) || "none").split(",").map(Number);
     return values.length === count && values.every(Number.isFinite) ? values : null;
   };
   const [position, rotation, fov] = [numbers("p", 3), numbers("q", 4), numbers("f", 1)];
   if (!position || !rotation || !fov || fov[0] <= 0.01 || fov[0] >= 3) return null;
   const camera = /** @type {Camera} */ ({ position, rotation: unit(/** @type {any} */ (rotation)), fov: fov[0] });
   const pivot = /** @type {any} */ (numbers("o", 3));
-  const view = numbers("v", 1);
-  return { camera, ...(pivot && { pivot }), ...(given.has("m") && { mode: given.get("m") ?? "color" }), ...(view && { view: view[0] }) };
+  // The server draws no other modes, and the scene may have lost the view.
+  const mode = MODES.find(([name]) => name === given.get("m"))?.[0] ?? "color";
+  const [view] = numbers("v", 1) ?? [];
+  return { camera, ...(pivot && { pivot }), mode, view: view !== undefined && view in state.get("views") ? view : null };
 }

@@ -247,6 +247,34 @@ test("a comparison ends where its view is left", async () => {
   await server.stop();
 });
 
+test("splats beside a wide picture reach into it as far as the renderer says", async () => {
+  // One in the middle, and one that is centred four of its sizes outside, where the projection stretches it.
+  const names = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split(" ");
+  const splat = (/** @type {number} */ x) => [x, 0, 0, 1.5, 1.5, 1.5, 6, ...Array(3).fill(Math.log(0.1)), 1, 0, 0, 0];
+  const values = Float32Array.from([0, -1.6].flatMap(splat));
+  const properties = names.map((name) => `property float ${name}\n`).join("");
+  const header = `ply\nformat binary_little_endian 1.0\nelement vertex 2\n${properties}end_header\n`;
+  const scene = join(scratch, "wide.ply");
+  writeFileSync(scene, Buffer.concat([Buffer.from(header), Buffer.from(values.buffer)]));
+  const server = await serve("view", scene, "--port", "0");
+  const { page, problems } = await open(drawing, server.address, { width: 400, height: 300 });
+  await set(page, { drawing: "local", axes: false, sidebar: false });
+  const aspect = await page.evaluate(() => {
+    const { clientWidth, clientHeight } = document.querySelector("irr-stage");
+    return clientWidth / clientHeight;
+  });
+  // The picture ends 1.2 units beside the first splat.
+  await set(page, { camera: { position: [0, 0, -1], rotation: [1, 0, 0, 0], fov: 2 * Math.atan(1.2 / aspect) }, view: null });
+  await sharp(page);
+  const shown = await picture(page);
+  const program = await rendered(page, scene, shown);
+  const at = (/** @type {import("pngjs").PNG} */ png) => png.data[4 * png.width * Math.floor(png.height / 2)];
+  assert.ok(at(program) > 10, `it is not seen: ${at(program)}`);
+  assert.ok(Math.abs(at(shown) - at(program)) <= 3, `${at(shown)} instead of ${at(program)}`);
+  assert.deepEqual(problems, []);
+  await server.stop();
+});
+
 test("the page and the program agree about camera paths", async () => {
   const server = await serve("view", trained(), "--port", "0");
   const { page } = await open(browser, server.address, { width: 300, height: 200 });

@@ -28,9 +28,14 @@ function reserve(size) {
   count = 0;
 }
 
+/** The most by which the projection stretches a splat away from the axis, between two tangents and the margin to which it clamps them
+ * (project.frag). @param {number} least @param {number} most */
+const stretch = (least, most) => Math.hypot(1, Math.max(-least, most) + 0.15 * (most - least));
+
 /** Indices of the splats in view, farthest first. @param {Look} look @returns {Uint32Array} */
 export function order({ forward: [fx, fy, fz], right: [rx, ry, rz], down: [dx, dy, dz], position: [px, py, pz], limits, near, first = 0, end = count }) {
   const [left, most, top, bottom] = limits;
+  const [wide, high] = [stretch(left, most), stretch(top, bottom)];
   let n = 0;
   let least = 0xffffffff;
   let largest = 0;
@@ -41,10 +46,11 @@ export function order({ forward: [fx, fy, fz], right: [rx, ry, rz], down: [dx, d
     const depth = fx * x + fy * y + fz * z;
     if (depth <= near) continue;
     const across = rx * x + ry * y + rz * z;
-    const radius = radii[i];
-    if (across < left * depth - radius || across > most * depth + radius) continue;
+    const aside = wide * radii[i];
+    if (across < left * depth - aside || across > most * depth + aside) continue;
     const along = dx * x + dy * y + dz * z;
-    if (along < top * depth - radius || along > bottom * depth + radius) continue;
+    const above = high * radii[i];
+    if (along < top * depth - above || along > bottom * depth + above) continue;
     depths[n] = depth;
     inView[n] = i;
     const key = bits[n];

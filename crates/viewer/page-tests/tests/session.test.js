@@ -66,6 +66,14 @@ test("views, comparison, tools and modes", async () => {
   await page.locator("irr-stage .overlay").click({ position: middle });
   await until(page, async () => (await import("/page/js/state.js")).state.get("picked")?.splat?.opacity > 0);
   await page.keyboard.press("m");
+  // A drag turns, and measures nothing.
+  const turned = (await get(page, "camera")).position;
+  await page.mouse.move(box.x + middle.x, box.y + middle.y);
+  await page.mouse.down();
+  await page.mouse.move(box.x + middle.x + 20, box.y + middle.y, { steps: 4 });
+  await page.mouse.up();
+  assert.notDeepEqual((await get(page, "camera")).position, turned);
+  assert.deepEqual(await get(page, "measured"), []);
   await page.locator("irr-stage .overlay").click({ position: middle });
   await until(page, async () => (await import("/page/js/state.js")).state.get("measured").length === 1);
   await page.locator("irr-stage .overlay").click({ position: { x: middle.x + 80, y: middle.y } });
@@ -299,6 +307,12 @@ test("an address holds the camera", async () => {
   const other = await open(browser, address, { width: 500, height: 400 });
   const [here, there] = [await get(page, "camera"), await get(other.page, "camera")];
   assert.ok(here.position.every((v, i) => Math.abs(v - there.position[i]) < 1e-4));
+  assert.equal(await get(other.page, "view"), null, "it is in no view");
+  // In the same tab, with a mode and a view that do not exist.
+  await page.evaluate(() => (location.hash = `${location.hash.replace(/f=[^&]*/, "f=0.5")}&m=nonsense&v=999`));
+  await until(page, async () => (await import("/page/js/state.js")).state.get("camera").fov === 0.5);
+  await sharp(page);
+  assert.deepEqual([await get(page, "mode"), await get(page, "view")], ["color", null]);
   await server.stop();
 });
 
@@ -307,12 +321,6 @@ test("every screen at 1440, 768 and 360 pixels", async () => {
   const server = await serve("view", process.env.SCREENS_OF ?? trained(), "--port", "0");
   for (const [width, height] of [[1440, 900], [768, 1024], [360, 740]]) {
     for (const theme of ["dark", "light"]) {
-  assert.equal(await get(other.page, "view"), null, "it is in no view");
-  // In the same tab, with a mode and a view that do not exist.
-  await page.evaluate(() => (location.hash = `${location.hash.replace(/f=[^&]*/, "f=0.5")}&m=nonsense&v=999`));
-  await until(page, async () => (await import("/page/js/state.js")).state.get("camera").fov === 0.5);
-  await sharp(page);
-  assert.deepEqual([await get(page, "mode"), await get(page, "view")], ["color", null]);
       const { page, problems } = await open(browser, server.address, { width, height, theme });
       await set(page, { drawing: "served" });
       const shoot = async (name) => {

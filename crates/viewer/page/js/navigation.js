@@ -12,6 +12,8 @@ import { state } from "./state.js";
 const RADIANS_PER_PIXEL = 0.006;
 /** Largest angle between the view and the horizon, radians: short of the poles. */
 const MAX_ELEVATION = 1.54;
+/** Distance within which a pressed pointer clicks and does not drag, CSS pixels. */
+export const CLICK_DISTANCE = 4;
 /** Seconds of a flight from one camera to another. */
 const FLIGHT_SECONDS = 0.45;
 /** Keys that move, with the camera axes they move along. @type {Record<string, Vec3>} */
@@ -23,7 +25,7 @@ export const MOVES = {
 const still = matchMedia("(prefers-reduced-motion: reduce)");
 
 export class Navigation {
-  /** @type {Map<number, { x: number, y: number }>} */
+  /** clicks: not moved so far. @type {Map<number, { x: number, y: number, clicks?: boolean }>} */
   pointers = new Map();
   /** @type {Set<string>} */
   keys = new Set();
@@ -55,11 +57,9 @@ export class Navigation {
   /** @param {PointerEvent} event */
   down(event) {
     if (this.claimed(event)) return;
-    const tool = state.get("tool");
-    if ((tool === "measure" || tool === "inspect") && event.button === 0) return;
     this.element.setPointerCapture(event.pointerId);
     this.element.focus({ preventScroll: true });
-    this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+    this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY, clicks: true });
     this.flight = null;
   }
 
@@ -68,7 +68,7 @@ export class Navigation {
     const before = this.pointers.get(event.pointerId);
     if (!before) return;
     const [dx, dy] = [event.clientX - before.x, event.clientY - before.y];
-    if (dx === 0 && dy === 0) return;
+    if (Math.hypot(dx, dy) < (before.clicks ? CLICK_DISTANCE : 1e-9)) return;
     if (this.pointers.size === 2) {
       const other = [...this.pointers].find(([id]) => id !== event.pointerId)?.[1] ?? before;
       const apart = (/** @type {{ x: number, y: number }} */ p) => Math.max(Math.hypot(p.x - other.x, p.y - other.y), 1);
@@ -227,7 +227,7 @@ export class Navigation {
 
   /** @param {MouseEvent} event */
   async setPivot(event) {
-    if (isEditTool(state.get("tool"))) return;
+    if (state.get("tool") !== "none") return;
     const picked = await this.pick(event.offsetX, event.offsetY);
     if (!picked?.point) return;
     const camera = state.get("camera");

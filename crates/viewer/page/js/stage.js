@@ -4,7 +4,7 @@ import { frameOn, intrinsics } from "./camera.js";
 import { connection, pictureOf } from "./connection.js";
 import { el } from "./dom.js";
 import { LocalRenderer } from "./local/renderer.js";
-import { Navigation } from "./navigation.js";
+import { CLICK_DISTANCE, Navigation } from "./navigation.js";
 import { drawEditing } from "./edit/overlay.js";
 import { Pointer } from "./edit/pointer.js";
 import { isEditTool } from "./edit/tools.js";
@@ -287,13 +287,13 @@ export class Stage extends HTMLElement {
   /** @param {MouseEvent} event */
   async useTool(event) {
     const tool = state.get("tool");
+    // A drag turns the view with these tools as well.
+    const still = Math.hypot(event.clientX - this.pressed.x, event.clientY - this.pressed.y) < CLICK_DISTANCE;
+    if (!still || isEditTool(tool)) return;
     if (tool === "none") {
-      if (this.pointer?.over) return;
-      const still = Math.hypot(event.clientX - this.pressed.x, event.clientY - this.pressed.y) < 4;
-      if (still) this.enterFrustum(event.offsetX, event.offsetY);
+      if (!this.pointer?.over) this.enterFrustum(event.offsetX, event.offsetY);
       return;
     }
-    if (isEditTool(tool)) return;
     const picked = await this.pickAt(event.offsetX, event.offsetY);
     if (tool === "inspect") state.set({ picked });
     if (tool === "measure" && picked?.point) {

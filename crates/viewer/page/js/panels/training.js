@@ -49,7 +49,8 @@ class TrainingPanel extends HTMLElement {
       pause.hidden = paused;
       resume.hidden = !paused;
       for (const control of [pause, resume, step, save, stop]) control.disabled = over;
-      said.textContent = now.warning ?? (now.saved !== null ? `Checkpoint of step ${now.saved}` : "");
+      const saved = now.saved === null ? "" : `Checkpoint of step ${now.saved}`;
+      said.textContent = [now.warning, saved].filter(Boolean).join(" · ");
       showPlan(plan, state.get("hello")?.plan, now.step / Math.max(now.total, 1), stage);
     });
     return section("Training", el("div", { className: "progress" }, bar), plan, el("div", { className: "row" }), body,

@@ -127,7 +127,7 @@ function gizmo(owner) {
     group.append(stem, ball, letter);
     const look = () => owner.navigation?.along(from);
     group.addEventListener("click", look);
-    group.addEventListener("keydown", (event) => /** @type {KeyboardEvent} */ (event).key === "Enter" && look());
+    group.addEventListener("keydown", (event) => ["Enter", " "].includes(/** @type {KeyboardEvent} */ (event).key) && look());
     return { group, stem, ball, letter, from };
   }));
   svg.append(...ends.map(({ group }) => group));

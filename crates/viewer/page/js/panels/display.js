@@ -160,7 +160,8 @@ class DisplayPanel extends HTMLElement {
       const digits = Math.min(9, Math.max(0, Math.ceil(4 - Math.log10(unit * (state.get("scene")?.radius || 1)))));
       const place = (/** @type {Vec3} */ point) => add(scale(point, unit), world().center).map((value) => value.toFixed(digits)).join("  ");
       body.replaceChildren(!picked ? el("p", { className: "note", textContent: "Click a splat to see its size, opacity, colour and depth." }) : facts([
-        ["Depth", short(Number((unit * picked.depth).toPrecision(6)))], ["Point", picked.point ? place(picked.point) : "–"],
+        ["Depth", short(picked.depth && Number((unit * picked.depth).toPrecision(6)))],
+        ["Point", picked.point ? place(picked.point) : "–"],
         ...(splat ? /** @type {[string, string][]} */ ([
           ["Splat", `number ${splat.index}, one of ${splat.of} in this pixel`], ["Share of the pixel", `${(100 * splat.weight).toFixed(1)} %`], ["Mean", place(splat.mean)],
           ["Sizes (1 σ)", list(scale(splat.scales, unit))], ["Opacity", splat.opacity.toFixed(3)], ["Colour", list(splat.color)],

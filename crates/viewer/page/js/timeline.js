@@ -26,7 +26,7 @@ class Timeline extends HTMLElement {
 
   show() {
     this.hidden = !path.shown || path.keys.length === 0;
-    if (this.hidden) this.playing = false;
+    if (this.hidden || path.keys.length < 2) this.playing = false;
     const total = Math.max(path.seconds, 1e-6);
     const keys = path.keys.map((key, index) => {
       const mark = el("button", { type: "button", className: "key", title: `Key frame at ${key.time.toFixed(1)} s; delete removes it`, "aria-label": `Key frame ${index + 1}` });

@@ -179,7 +179,8 @@ export class LocalRenderer {
   /** Stops using a painter that fails, unless it is out of use already: a frame fails after its device is lost.
    * @param {WebGpu | WebGl | null} painter @param {unknown} error */
   giveUp(painter, error) {
-    if (painter === null || painter === this.gpu) return this.withoutGpu(message(error));
+    if (painter !== null && painter === this.gpu) return this.withoutGpu(message(error));
+    if (painter === null || painter !== this.webGl) return;
     this.webGl = null;
     if (this.painter === painter) this.use(null);
     this.report(message(error));
@@ -244,6 +245,8 @@ export class LocalRenderer {
     } catch (error) {
       this.giveUp(painter, error);
     }
+    // No block follows that would renew the picture.
+    if (counts[0] === 0) this.redraw();
   }
 
   /** @param {WebGpu | WebGl} painter @param {import("./stream.js").Block} block */
@@ -384,10 +387,10 @@ export class LocalRenderer {
     this.k = { width, height, fx, fy, cx: ((1 - projection[8]) * width) / 2, cy: ((1 + projection[9]) * height) / 2 };
     this.wanted = { camera, shot: this.wanted?.shot ?? {} };
     this.level = 0;
+    if (this.webGl && this.scene) this.fetch(this.webGl, this.scene);
     this.aim();
     this.webGl?.eye(to, port, camera, this.k, this.options({}, false));
   }
-    if (this.webGl && this.scene) this.fetch(this.webGl, this.scene);
 }
 
 /** @param {Intrinsics} k @param {number} share of its sides @returns {Intrinsics} */

@@ -22,7 +22,6 @@ use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
 use irradia_runs::formats::{SplatFormat, encode_splats};
-use irradia_scene::Photo;
 use serde_json::json;
 use std::collections::HashMap;
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -322,7 +321,7 @@ async fn upload(State(shared): App, Path(name): Path<String>, body: Body) -> Res
 }
 
 /// The photograph of a view as JPEG, with at most `side` pixels on its longer side.
-async fn photo(State(shared): App, view: usize, side: Option<u32>) -> Response {
+async fn photo(State(shared): App, index: usize, side: Option<u32>) -> Response {
     let answer = |bytes: Bytes| {
         (
             [(CONTENT_TYPE, "image/jpeg"), (CACHE_CONTROL, "private, max-age=3600")],
@@ -332,23 +331,23 @@ async fn photo(State(shared): App, view: usize, side: Option<u32>) -> Response {
     };
     let thumbnails = || shared.thumbnails.lock().unwrap_or_else(PoisonError::into_inner);
     if side.is_some()
-        && let Some(bytes) = thumbnails().get(&view)
+        && let Some(bytes) = thumbnails().get(&index)
     {
         return answer(bytes.clone());
     }
-    let source = shared.subject.views.0.get(view).and_then(|view| view.photo.clone());
+    let view = shared.subject.views.0.get(index);
+    let source = view.and_then(|view| Some((view.photo.clone()?, view.camera.intrinsics)));
     let background = shared
         .subject
         .edition()
         .map_or([0.0; 3], |edition| edition.scene().options.background);
-    let (Some(source), Ok(_permit)) = (source, shared.decoding.acquire().await) else {
+    let (Some((source, k)), Ok(_permit)) = (source, shared.decoding.acquire().await) else {
         return StatusCode::NOT_FOUND.into_response();
     };
     let encoded = tokio::task::spawn_blocking(move || {
-        let photo = source.load()?;
-        let photo = match side {
-            Some(side) => fit_photo(&photo, side),
-            None => photo,
+        let photo = match side.map(|side| fit([k.width, k.height], side)) {
+            Some([width, height]) => source.load_at(width, height)?,
+            None => source.load()?,
         };
         Ok::<_, irradia_scene::LoadError>(encode(
             &photo.over(background),
@@ -362,7 +361,7 @@ async fn photo(State(shared): App, view: usize, side: Option<u32>) -> Response {
             let bytes = Bytes::from(jpeg);
             let mut kept = thumbnails();
             if side.is_some() && kept.values().map(Bytes::len).sum::<usize>() < MAX_THUMBNAIL_BYTES {
-                kept.insert(view, bytes.clone());
+                kept.insert(index, bytes.clone());
             }
             answer(bytes)
         }
@@ -374,9 +373,8 @@ async fn photo(State(shared): App, view: usize, side: Option<u32>) -> Response {
     }
 }
 
-/// `photo` with at most `side` pixels on its longer side.
-fn fit_photo(photo: &Photo, side: u32) -> Photo {
-    let factor = (side as f32 / photo.width.max(photo.height) as f32).min(1.0);
-    let scaled = |side: u32| ((side as f32 * factor).round() as u32).max(1);
-    photo.resized(scaled(photo.width), scaled(photo.height))
+/// `size` with at most `side` pixels on the longer side.
+fn fit(size: [u32; 2], side: u32) -> [u32; 2] {
+    let factor = (side as f32 / size[0].max(size[1]) as f32).min(1.0);
+    size.map(|side| ((side as f32 * factor).round() as u32).max(1))
 }

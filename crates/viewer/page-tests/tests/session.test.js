@@ -292,6 +292,30 @@ test("on a screen of another density the picture has its pixels", async () => {
   await server.stop();
 });
 
+test("the preview of a path ends when the camera is moved", async () => {
+  const server = await serve("view", trained(), "--port", "0");
+  const { page } = await open(browser, server.address, { width: 500, height: 400 });
+  await set(page, { drawing: "served", tab: "path" });
+  await page.evaluate(async () => {
+    const [{ path }, { state }] = await Promise.all(["path", "state"].map((name) => import(`/page/js/${name}.js`)));
+    const camera = state.get("camera");
+    path.loop = true;
+    for (const x of [0, 1]) path.add({ ...camera, position: [camera.position[0] + x, camera.position[1], camera.position[2]] });
+  });
+  const moves = async () => {
+    const before = await get(page, "camera");
+    await page.waitForTimeout(300);
+    return (await get(page, "camera")).position[0] !== before.position[0];
+  };
+  await page.keyboard.press(" ");
+  assert.ok(await moves());
+  await page.locator("irr-stage .overlay").hover();
+  await page.mouse.wheel(0, -100);
+  await until(page, () => document.querySelector("irr-timeline").playing === false);
+  assert.equal(await moves(), false);
+  await server.stop();
+});
+
 test("an address holds the camera", async () => {
   const server = await serve("view", trained(), "--port", "0");
   const { page } = await open(browser, server.address, { width: 500, height: 400 });

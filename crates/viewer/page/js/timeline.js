@@ -8,6 +8,8 @@ import { state } from "./state.js";
 class Timeline extends HTMLElement {
   seconds = 0;
   playing = false;
+  /** The camera that was shown last. @type {import("./camera.js").Camera | null} */
+  camera = null;
 
   connectedCallback() {
     this.setAttribute("role", "group");
@@ -21,6 +23,8 @@ class Timeline extends HTMLElement {
     this.track.addEventListener("pointermove", (event) => event.buttons && this.seek(event));
     path.addEventListener("change", () => this.show());
     path.addEventListener("toggle", () => this.toggle());
+    // Whoever moves the camera ends the preview.
+    state.addEventListener("camera", () => (this.playing &&= state.get("camera") === this.camera));
     this.show();
   }
 
@@ -69,8 +73,7 @@ class Timeline extends HTMLElement {
         if (path.loop) this.seconds %= path.seconds;
         else [this.seconds, this.playing] = [path.seconds, false];
       }
-      state.set({ camera: path.at(this.seconds), view: null });
-      this.tell();
+      this.look();
       requestAnimationFrame(frame);
     };
     requestAnimationFrame(frame);
@@ -81,7 +84,13 @@ class Timeline extends HTMLElement {
     const box = this.track?.getBoundingClientRect();
     if (!box || path.keys.length === 0) return;
     this.seconds = (Math.min(1, Math.max(0, (event.clientX - box.left) / box.width))) * path.seconds;
-    state.set({ camera: path.at(this.seconds), view: null });
+    this.look();
+  }
+
+  /** Shows the camera at the current time. */
+  look() {
+    this.camera = path.at(this.seconds);
+    state.set({ camera: this.camera, view: null });
     this.tell();
   }
 }

@@ -91,6 +91,11 @@ export class Stage extends HTMLElement {
       this.sent.clear();
       this.dirty = true;
     });
+    // A page that nobody sees takes no time from a training.
+    document.addEventListener("visibilitychange", () => {
+      if (document.hidden) connection.send({ do: "rest" });
+      this.dirty = true;
+    });
     connection.addEventListener("picture", (event) => this.receive(/** @type {CustomEvent} */ (event).detail));
     this.overlay.addEventListener("pointerdown", (event) => (this.pressed = { x: event.clientX, y: event.clientY }));
     this.overlay.addEventListener("click", (event) => this.useTool(event));

@@ -78,9 +78,9 @@ documented! {
         /// Maximum number of splats per pixel of a training image, averaged over views; no such limit when absent.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         pub splats_per_pixel: Option<f32>,
-        /// Radius around each training camera within which splats are removed at every round of density control, as a fraction of
-        /// the depth of the nearest points that its view sees (or of its depth bounds); at most a seventh of that where points that the view
-        /// need not show are closer; 0 for none. If it is above 0 and photographs are at least 8 degrees apart, splats that only one of them
+        /// Distance from each training camera within which splats up to 60 degrees from its axis are removed at every round of density
+        /// control, as a fraction of the depth of the nearest points that its view sees (or of its depth bounds); at most a seventh of that
+        /// where points that the view need not show are closer; 0 for none. If it is above 0 and photographs are at least 8 degrees apart, splats that only one of them
         /// sees, among other cameras and away from points, are moved far away.
         #[serde(default, skip_serializing_if = "is_default")]
         pub free_space: f32,

@@ -2,13 +2,11 @@
 
 import { view } from "irradia/assets.js";
 import { add, axes, clamp, dot, length, mix, multiply, rotate, scale, slerp, subtract, turn, unit } from "irradia/math.js";
-import { LocalRenderer } from "irradia/renderer.js";
+import { LocalRenderer, screenDensity } from "irradia/renderer.js";
 
 /** Radians per pixel of dragging, and the largest angle between the view and the horizon. */
 const RADIANS_PER_PIXEL = 0.006;
 const MAX_ELEVATION = 1.54;
-/** Largest number of device pixels per CSS pixel. */
-const MAX_DENSITY = 2;
 
 const stage = /** @type {HTMLElement} */ (document.getElementById("stage"));
 const message = /** @type {HTMLElement} */ (document.getElementById("message"));
@@ -25,13 +23,12 @@ renderer.ready.then(() => {
 // For tests, and for pages that embed this one.
 Object.assign(window, { irradia: { renderer, camera: () => camera, set: (to) => ((camera = to), (stale = true)) } });
 
-const density = () => Math.min(devicePixelRatio || 1, MAX_DENSITY);
-/** With which the last picture was drawn. */
-let drawn = density();
+/** The density of the last picture. */
+let drawn = screenDensity();
 
 /** Pixels and focal length: the picture shows at least as much in width and height as at the start. */
 function intrinsics() {
-  const [width, height] = [stage.clientWidth, stage.clientHeight].map((side) => Math.max(1, Math.round(side * density())));
+  const [width, height] = [stage.clientWidth, stage.clientHeight].map((side) => Math.max(1, Math.round(side * screenDensity())));
   const vertical = height / 2 / Math.tan(camera.fov / 2);
   const focal = Math.min(vertical, (vertical * width) / height / view.aspect);
   return { width, height, fx: focal, fy: focal, cx: width / 2, cy: height / 2 };
@@ -55,7 +52,7 @@ function orbit(dx, dy) {
 /** Moves camera and pivot across the view. @param {number} dx @param {number} dy pixels */
 function pan(dx, dy) {
   const [right, down] = axes(camera.rotation);
-  const step = reach() / intrinsics().fy * density();
+  const step = reach() / intrinsics().fy * screenDensity();
   const move = add(scale(right, -dx * step), scale(down, -dy * step));
   pivot = add(pivot, move);
   camera = { ...camera, position: add(camera.position, move) };
@@ -161,8 +158,8 @@ function frame(now) {
     [camera, stale] = [along(seconds), true];
     if (seconds >= (view.path.keys.length - 1) * view.path.step) fly(null);
   }
-  if (stale || drawn !== density()) {
-    [stale, drawn] = [false, density()];
+  if (stale || drawn !== screenDensity()) {
+    [stale, drawn] = [false, screenDensity()];
     renderer.want(camera, intrinsics(), {});
   }
   if (renderer.draw(now) && renderer.drawn > 0) {

@@ -345,8 +345,11 @@ async fn photo(State(shared): App, index: usize, side: Option<u32>) -> Response 
         return StatusCode::NOT_FOUND.into_response();
     };
     let encoded = tokio::task::spawn_blocking(move || {
-        let photo = match side.map(|side| fit([k.width, k.height], side)) {
-            Some([width, height]) => source.load_at(width, height)?,
+        let photo = match side {
+            Some(side) => {
+                let k = k.scaled((side as f32 / k.width.max(k.height) as f32).min(1.0));
+                source.load_at(k.width, k.height)?
+            }
             None => source.load()?,
         };
         Ok::<_, irradia_scene::LoadError>(encode(
@@ -371,10 +374,4 @@ async fn photo(State(shared): App, index: usize, side: Option<u32>) -> Response 
         }
         Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
     }
-}
-
-/// `size` with at most `side` pixels on the longer side.
-fn fit(size: [u32; 2], side: u32) -> [u32; 2] {
-    let factor = (side as f32 / size[0].max(size[1]) as f32).min(1.0);
-    size.map(|side| ((side as f32 * factor).round() as u32).max(1))
 }

@@ -3,7 +3,7 @@
 import { frameOn, intrinsics } from "./camera.js";
 import { connection, pictureOf } from "./connection.js";
 import { el } from "./dom.js";
-import { LocalRenderer } from "./local/renderer.js";
+import { LocalRenderer, screenDensity } from "./local/renderer.js";
 import { CLICK_DISTANCE, Navigation } from "./navigation.js";
 import { drawEditing } from "./edit/overlay.js";
 import { Pointer } from "./edit/pointer.js";
@@ -20,8 +20,6 @@ import { state } from "./state.js";
 export const LOCAL_MODES = ["color", "ellipses", "rings", "points"];
 /** Number of splats beyond which the server draws, unless the user chooses otherwise. */
 const MAX_LOCAL_SPLATS = 3e6;
-/** Largest number of device pixels per CSS pixel. */
-const MAX_DENSITY = 2;
 /** Maximum side of a picture that the server draws, pixels. */
 const MAX_SIDE = 4096;
 /** Milliseconds between the two pictures of a blink. */
@@ -116,7 +114,7 @@ export class Stage extends HTMLElement {
   }
 
   resize() {
-    this.density = densityNow();
+    this.density = screenDensity();
     if (this.overlay) {
       this.overlay.width = Math.round(this.clientWidth * this.density);
       this.overlay.height = Math.round(this.clientHeight * this.density);
@@ -188,7 +186,7 @@ export class Stage extends HTMLElement {
   frame(now) {
     this.navigation?.tick(now);
     // On a screen of another density, the stage may have the same size.
-    if (densityNow() !== this.density) this.resize();
+    if (screenDensity() !== this.density) this.resize();
     if (!this.served || !this.drawn || !this.local) return;
     const local = this.drawsLocally;
     if (this.dirty) {
@@ -364,9 +362,6 @@ export class Stage extends HTMLElement {
     this.clipPhoto();
   }
 }
-
-/** Device pixels per CSS pixel. */
-const densityNow = () => Math.min(devicePixelRatio || 1, MAX_DENSITY);
 
 /** @param {string} hex @returns {[number, number, number]} */
 export function rgb(hex) {

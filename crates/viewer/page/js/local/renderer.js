@@ -26,6 +26,11 @@ const MAX_WAIT = 1500;
 const RETRY_DELAY = 100;
 /** Milliseconds within which a second loss of WebGL2 means that the GPU cannot draw the scene. */
 const MIN_LIFE = 30000;
+/** Largest number of device pixels per CSS pixel. */
+const MAX_DENSITY = 2;
+
+/** Device pixels per CSS pixel of pictures on the current screen. */
+export const screenDensity = () => Math.min(devicePixelRatio || 1, MAX_DENSITY);
 
 export class LocalRenderer {
   /** The current painter; null before the first one is open, and if there is none. @type {WebGpu | WebGl | null} */

@@ -31,7 +31,10 @@ async function edited(page, holds) {
     if (Date.now() > end) throw new Error(`it never held: ${holds} of ${JSON.stringify(editing)}`);
     await page.waitForTimeout(30);
   }
-  await page.waitForTimeout(150);
+  await until(page, async () => {
+    const { drawsLocally, shown } = document.querySelector("irr-stage");
+    return drawsLocally || shown?.header?.version >= (await import("/page/js/state.js")).state.get("editing").version;
+  });
   await sharp(page);
 }
 

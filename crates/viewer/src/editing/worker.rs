@@ -35,7 +35,7 @@ struct Workspace {
 /// The state that pages are told of a scene of `splats` splats before the first request.
 pub(super) fn initial_state(splats: usize) -> Value {
     json!({
-        "tell": "editing", "selected": 0, "of": splats, "hidden": 0, "locked": 0, "box": null, "at": 0, "first": 0, "total": 0,
+        "tell": "editing", "version": 1, "selected": 0, "of": splats, "hidden": 0, "locked": 0, "box": null, "at": 0, "first": 0, "total": 0,
         "entries": [], "gesture": 0, "before": false, "busy": false, "mask": 0, "saved": null,
     })
 }
@@ -71,7 +71,7 @@ pub(crate) fn run_editing(
             {
                 tell(client, &format!("unsaved edits would be lost in a crash: {error}"));
             }
-            state = workspace.to_json();
+            state = workspace.to_json(subject);
         }
         wake();
         editing.publish(state);
@@ -187,7 +187,7 @@ impl Workspace {
     }
 
     /// The state that pages are told.
-    fn to_json(&self) -> Value {
+    fn to_json(&self, subject: &Subject) -> Value {
         let session = &self.session;
         let (draft, selected) = (session.draft(), session.selected());
         let (at, total) = (session.position(), session.entries().len());
@@ -202,6 +202,7 @@ impl Workspace {
             .collect();
         json!({
             "tell": "editing",
+            "version": subject.edition().map(|edition| edition.version),
             "selected": selected.count(),
             "of": draft.len(),
             "hidden": draft.hidden.count(),

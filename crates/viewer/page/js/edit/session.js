@@ -5,9 +5,9 @@ import { state } from "../state.js";
 
 /** @typedef {import("../math.js").Vec3} Vec3 */
 /** One entry of the list. @typedef {{ kind: "select" | "edit", text: string }} Entry */
-/** What the server tells about the session: how many splats are selected, of how many, and the box around nearly all of them; the list from
+/** What the server tells about the session: the version of the scene with its selection, as in the headers of pictures; how many splats are selected, of how many, and the box around nearly all of them; the list from
  * entry `first` on, of which the first `at` entries are made; the gesture of the last one made.
- * @typedef {{ selected: number, of: number, hidden: number, locked: number, box: [Vec3, Vec3] | null, at: number, first: number,
+ * @typedef {{ version: number, selected: number, of: number, hidden: number, locked: number, box: [Vec3, Vec3] | null, at: number, first: number,
  *   total: number, entries: Entry[], gesture: number, before: boolean, busy: boolean, mask: number, saved: string | null }} Editing */
 /** How a shape changes the selection. @typedef {"replace" | "add" | "subtract" | "intersect"} Mode */
 

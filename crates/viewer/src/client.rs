@@ -286,13 +286,15 @@ fn handle(shared: &Shared, client: u64, message: Message, limiter: &mut RateLimi
         }
         Request::Unit { metres } => {
             let folder = subject.folder.as_ref();
-            let kept = folder.map(|folder| folder.set_metres_per_unit(metres));
-            let reply = match kept {
-                Some(Ok(())) => json!({ "tell": "unit", "metres": metres }),
-                Some(Err(error)) => json!({ "tell": "problem", "text": error.to_string() }),
-                None => json!({ "tell": "problem", "text": "the scale can only be saved in the folder of a run" }),
+            let problem = match folder.map(|folder| folder.set_metres_per_unit(metres)) {
+                Some(Ok(())) => {
+                    scheduler.send_text_to_all(&json!({ "tell": "unit", "metres": metres }).to_string());
+                    return Outcome::Continue;
+                }
+                Some(Err(error)) => error.to_string(),
+                None => "the scale can only be saved in the folder of a run".to_owned(),
             };
-            scheduler.send_text(client, reply.to_string());
+            scheduler.send_text(client, json!({ "tell": "problem", "text": problem }).to_string());
         }
     }
     Outcome::Continue

@@ -273,6 +273,13 @@ impl Scheduler {
         self.with_client(client, |client| drop(client.outbox.try_send(OutMessage::Text(text))));
     }
 
+    /// Tells all pages something.
+    pub fn send_text_to_all(&self, text: &str) {
+        for client in self.lock().clients.values() {
+            let _ = client.outbox.try_send(OutMessage::Text(text.to_owned()));
+        }
+    }
+
     /// Leaves time to a training after drawing for a moving camera took `seconds`; the browser needs about as much again.
     pub fn pause_drawing(&self, seconds: f32) {
         self.lock().rest_until = Some(Instant::now() + Duration::from_secs_f32(4.5 * seconds));

@@ -322,7 +322,10 @@ fn metres_are_those_per_unit_of_the_scene_as_it_was_opened_however_edits_scale_i
     let hello = next_message(&mut opened.socket(), "hello");
     assert_eq!(hello["scene"]["placement"]["scale"], json!(4.0));
     assert_eq!(hello["metres"], json!(2.0));
+    let mut second = page(&opened);
     send_request(&mut first, &json!({ "do": "unit", "metres": 3 }));
-    assert_eq!(next_message(&mut first, "unit")["metres"], json!(3.0));
+    for page in [&mut first, &mut second] {
+        assert_eq!(next_message(page, "unit")["metres"], json!(3.0));
+    }
     assert_eq!(next_message(&mut opened.socket(), "hello")["metres"], json!(3.0));
 }

@@ -97,6 +97,9 @@ factor = 2
   await edited(page, (e) => e.at === 3 && e.of === all);
   await page.getByLabel("edits.toml", { exact: true }).setInputFiles({ name: "edits.toml", mimeType: "text/plain", buffer: Buffer.from("nonsense") });
   await until(page, async () => document.body.innerText.includes("TOML") || document.body.innerText.includes("list"));
+  await page.getByLabel("edits.toml", { exact: true }).setInputFiles({ name: "edits.toml", mimeType: "text/plain", buffer: Buffer.alloc(17 << 20, "#") });
+  await page.getByText("takes 17 MiB").waitFor();
+  assert.equal(await get(page, "connection"), "open");
   assert.deepEqual(problems, []);
   await server.stop();
 });

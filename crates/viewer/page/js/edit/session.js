@@ -11,6 +11,9 @@ import { state } from "../state.js";
  *   total: number, entries: Entry[], gesture: number, before: boolean, busy: boolean, mask: number, saved: string | null }} Editing */
 /** How a shape changes the selection. @typedef {"replace" | "add" | "subtract" | "intersect"} Mode */
 
+/** Maximum bytes of a request, as in message.rs: beyond it the server ends the connection. */
+const MAX_REQUEST = 16 * 2 ** 20;
+
 class Session {
   /** The latest gesture number; it starts at random, so that the gestures of two pages differ. */
   gestures = Math.floor(Math.random() * 2 ** 30) * 2 ** 20;
@@ -74,7 +77,11 @@ class Session {
 
   /** @param {string} list an `edits.toml` */
   replay(list) {
-    this.send({ do: "replay", list });
+    const request = { do: "replay", list };
+    const bytes = new Blob([JSON.stringify(request)]).size;
+    if (bytes <= MAX_REQUEST) return this.send(request);
+    const size = `${(bytes / 2 ** 20).toFixed(0)} MiB`;
+    state.set({ problem: `This list of edits takes ${size}, and a page sends at most 16: make its edits with irradia edit --edits` });
   }
 
   /** Adds the splats of another scene. @param {File} file of any splat format */

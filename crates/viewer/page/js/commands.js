@@ -1,6 +1,7 @@
 // The commands of the page with their keys: the toolbar, the keyboard and the help sheet use this list.
 
 import { connection } from "./connection.js";
+import { hasDialog } from "./dom.js";
 import { session } from "./edit/session.js";
 import { MOVES } from "./navigation.js";
 import { path } from "./path.js";
@@ -121,7 +122,7 @@ export const COMMANDS = {
 
 addEventListener("keydown", (event) => {
   const target = /** @type {HTMLElement} */ (event.target);
-  if (event.altKey || target.matches("input:not([type=range]):not([type=checkbox]), select, dialog *")) return;
+  if (event.altKey || hasDialog() || target.matches("input:not([type=range]):not([type=checkbox]), select")) return;
   if (event.key === " " && target.matches("button, [role=button], input")) return;
   // These keys go by their position on the keyboard, whatever its layout.
   if (event.code in MOVES && !event.ctrlKey && !event.metaKey) return;

@@ -13,6 +13,9 @@ export function el(tag, properties = {}, ...children) {
   return element;
 }
 
+/** Whether a dialog is open, behind which no key acts: a click beside its controls takes the focus out of it. */
+export const hasDialog = () => document.querySelector("dialog[open]") !== null;
+
 /** Marks a button as pressed or not. @param {HTMLElement} button @param {boolean} pressed */
 export const press = (button, pressed) => button.setAttribute("aria-pressed", String(pressed));
 

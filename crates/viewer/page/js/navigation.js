@@ -1,6 +1,7 @@
 // Orbit, fly and walk with mouse, touch, trackpad and keyboard.
 
 import { forward } from "./camera.js";
+import { hasDialog } from "./dom.js";
 import { add, axes, clamp, cross, dot, length, lookAt, mix, multiply, normalize, rotate, scale, slerp, subtract, turn, unit } from "./math.js";
 import { isEditTool } from "./edit/tools.js";
 import { state } from "./state.js";
@@ -159,7 +160,7 @@ export class Navigation {
   /** @param {KeyboardEvent} event @param {boolean} pressed */
   key(event, pressed) {
     const within = /** @type {HTMLElement} */ (event.target);
-    const writes = within.matches?.("input, select, textarea, dialog *, .tabs *");
+    const writes = hasDialog() || within.matches?.("input, select, textarea, .tabs *");
     this.fast = event.shiftKey;
     if (!pressed) this.keys.delete(event.code);
     else if (!writes && !event.ctrlKey && !event.metaKey && !event.altKey && event.code in MOVES) {

@@ -120,6 +120,35 @@ test("the list of views stays where it is while scores arrive", async () => {
   await server.stop();
 });
 
+test("a photograph that cannot be loaded is explained, and requested again", async () => {
+  const server = await serve("view", trained(), "--port", "0");
+  const { page } = await open(browser, server.address, { width: 500, height: 400 });
+  await set(page, { drawing: "served", view: 0 });
+  await page.route("**/photo?*", (route) => route.fulfill({ status: 404, body: "r_0.png is damaged" }));
+  await set(page, { compare: "slider" });
+  await page.getByText("r_0.png is damaged").waitFor();
+  await page.unroute("**/photo?*");
+  await set(page, { compare: "blink" });
+  await until(page, () => document.querySelector("img.photo").naturalWidth > 0);
+  await server.stop();
+});
+
+test("no key acts behind the sheet of keys", async () => {
+  const server = await serve("view", trained(), "--port", "0");
+  const { page } = await open(browser, server.address, { width: 900, height: 700 });
+  await set(page, { frusta: false });
+  const before = await get(page, "camera");
+  await page.keyboard.press("?");
+  // Takes the focus from the button.
+  await page.getByRole("heading", { name: "Keys and gestures" }).click();
+  for (const key of ["v", "w", "ArrowLeft", "x"]) await page.keyboard.press(key, { delay: 50 });
+  assert.deepEqual([await get(page, "frusta"), await get(page, "camera")], [false, before]);
+  await page.keyboard.press("Escape");
+  await page.keyboard.press("v");
+  assert.equal(await get(page, "frusta"), true);
+  await server.stop();
+});
+
 test("a scene is shown in the light of one of its photographs", async () => {
   const dark = 3;
   const server = await serve("view", lit(27, dark), "--port", "0");

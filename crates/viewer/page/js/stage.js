@@ -55,6 +55,7 @@ export class Stage extends HTMLElement {
     this.context = this.served.getContext("bitmaprenderer");
     this.drawn = el("div", { className: "local", hidden: true });
     this.photo = /** @type {HTMLImageElement} */ (el("img", { className: "photo", hidden: true, alt: "" }));
+    this.photo.onerror = () => this.losePhoto();
     this.overlay = /** @type {HTMLCanvasElement} */ (el("canvas", { className: "overlay", tabIndex: 0 }));
     this.overlay.setAttribute("role", "img");
     this.overlay.setAttribute("aria-label", "The scene. Drag to turn, scroll to come nearer, question mark for all keys");
@@ -335,6 +336,20 @@ export class Stage extends HTMLElement {
       this.blinking = setInterval(() => {
         photo.style.visibility = photo.style.visibility === "visible" ? "hidden" : "visible";
       }, BLINK_INTERVAL);
+    }
+  }
+
+  /** Tells why the photograph cannot be shown, which an image does not know; it is requested again when it is shown the next time. */
+  async losePhoto() {
+    const address = this.photo?.getAttribute("src");
+    if (!address) return;
+    this.photo?.removeAttribute("src");
+    try {
+      const response = await fetch(address);
+      const why = response.ok ? "" : await response.text();
+      state.set({ problem: why || "The photograph was not loaded: compare again to try again" });
+    } catch {
+      // The connection is lost, which is told already.
     }
   }
 

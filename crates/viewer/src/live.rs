@@ -16,6 +16,8 @@ use std::time::{Duration, Instant};
 const MAX_CURVE_POINTS: usize = 1024;
 /// Number of points of the plan.
 const PLAN_POINTS: usize = 200;
+/// Maximum number of warnings that are kept.
+const MAX_WARNINGS: usize = 20;
 /// Time over which the speed is averaged, seconds.
 const SPEED_WINDOW_SECONDS: f64 = 3.0;
 
@@ -53,7 +55,8 @@ struct History {
     steps_per_second: f64,
     last_step_at: Option<Instant>,
     saved: Option<u64>,
-    warning: Option<String>,
+    /// The latest different ones.
+    warnings: Vec<String>,
 }
 
 /// The part of the history that a page already has.
@@ -104,20 +107,7 @@ impl Live {
         Self {
             snapshots,
             control: Mutex::default(),
-            history: Mutex::new(History {
-                phase: Phase::Preparing,
-                newest: None,
-                total_steps: trainer.total_steps(),
-                curve: Vec::new(),
-                point_interval: 1,
-                thinned: 0,
-                stages: Vec::new(),
-                mse: None,
-                steps_per_second: 0.0,
-                last_step_at: None,
-                saved: None,
-                warning: None,
-            }),
+            history: Mutex::new(History::new(trainer.total_steps())),
             due: Mutex::new(None),
             on_change: OnceLock::new(),
             plan: json!({
@@ -193,7 +183,7 @@ impl Live {
             "memory": memory(),
             "stages": history.stages,
             "saved": history.saved,
-            "warning": history.warning,
+            "warnings": history.warnings,
             "from": from,
             "curve": history.curve[from..],
         })
@@ -247,7 +237,7 @@ impl Live {
             }),
             Event::StageEntered { stage, step, .. } => lock(&self.history).stages.push((*step, stage.clone())),
             Event::Saved { step, .. } => lock(&self.history).saved = Some(*step),
-            Event::Warned { message } => lock(&self.history).warning = Some(message.clone()),
+            Event::Warned { message } => lock(&self.history).warn(message),
             Event::Paused { .. } => lock(&self.history).phase = Phase::Paused,
             Event::Resumed { .. } => {
                 let mut history = lock(&self.history);
@@ -294,6 +284,31 @@ impl Live {
 }
 
 impl History {
+    fn new(total_steps: u64) -> Self {
+        Self {
+            phase: Phase::Preparing,
+            newest: None,
+            total_steps,
+            curve: Vec::new(),
+            point_interval: 1,
+            thinned: 0,
+            stages: Vec::new(),
+            mse: None,
+            steps_per_second: 0.0,
+            last_step_at: None,
+            saved: None,
+            warnings: Vec::new(),
+        }
+    }
+
+    /// Keeps a warning as the latest one.
+    fn warn(&mut self, message: &str) {
+        self.warnings.retain(|known| known != message);
+        self.warnings.push(message.to_owned());
+        let dropped = self.warnings.len().saturating_sub(MAX_WARNINGS);
+        self.warnings.drain(..dropped);
+    }
+
     fn push(&mut self, point: CurvePoint) {
         match self.curve.last_mut() {
             Some(last) if last.step == point.step => last.psnr = point.psnr.or(last.psnr),
@@ -368,5 +383,23 @@ impl Observer for RoleObserver {
             }
         }
         self.0.signal(self.1)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_latest_warnings_are_kept_each_once() {
+        let mut history = History::new(1);
+        for message in ["a", "b", "a"] {
+            history.warn(message);
+        }
+        assert_eq!(history.warnings, ["b", "a"]);
+        for number in 0..MAX_WARNINGS {
+            history.warn(&number.to_string());
+        }
+        assert_eq!((history.warnings.len(), &*history.warnings[0]), (MAX_WARNINGS, "0"));
     }
 }

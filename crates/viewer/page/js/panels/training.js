@@ -30,7 +30,7 @@ class TrainingPanel extends HTMLElement {
     const stop = button("Stop and finish", "stop", "Stop, save, evaluate; resume later with irradia train --resume");
     stop.onclick = () => confirm("Stop the training and finish? It can be resumed later.") && train("stop");
     const plan = el("div", { className: "plan", role: "img" });
-    const said = el("p", { className: "note", role: "status" });
+    const said = el("p", { className: "note lines", role: "status" });
     state.watch(["train"], () => {
       const now = state.get("train");
       if (!now) return;
@@ -50,7 +50,9 @@ class TrainingPanel extends HTMLElement {
       resume.hidden = !paused;
       for (const control of [pause, resume, step, save, stop]) control.disabled = over;
       const saved = now.saved === null ? "" : `Checkpoint of step ${now.saved}`;
-      said.textContent = [now.warning, saved].filter(Boolean).join(" · ");
+      const lines = [...now.warnings, saved].filter(Boolean).join("\n");
+      // Screen readers read it out whenever it is set.
+      if (said.textContent !== lines) said.textContent = lines;
       showPlan(plan, state.get("hello")?.plan, now.step / Math.max(now.total, 1), stage);
     });
     return section("Training", el("div", { className: "progress" }, bar), plan, el("div", { className: "row" }), body,

@@ -2,8 +2,9 @@
 //!
 //! - `Host` must be an address, `localhost` or the host given by `--host`: a name that an attacker points at this machine (DNS
 //!   rebinding) is refused.
-//! - `Origin`, if a browser sends it, must be this server: no page of another site can open the socket. Requests from another
-//!   site without an origin, such as those for images, are recognised by `Sec-Fetch-Site`.
+//! - `Origin`, if a browser sends it, must be this server, over HTTP or, behind a proxy that ends TLS, over HTTPS: no page of another site
+//!   can open the socket. Requests from another site without an origin, such as those for images, and from a page of the same host under
+//!   the other scheme, are recognised by `Sec-Fetch-Site`.
 //! - Beyond loopback every request needs the token: first in the address, then in a cookie.
 
 use axum::http::header::{COOKIE, HOST, ORIGIN};
@@ -63,8 +64,13 @@ impl Guard {
         if headers.get_all(HOST).iter().count() != 1 || !self.is_own_host(host) {
             return Err(Refusal::Host);
         }
+        let is_own = |origin: &str| {
+            ["http://", "https://"]
+                .iter()
+                .any(|scheme| origin.strip_prefix(scheme) == Some(host))
+        };
         match headers.get(ORIGIN) {
-            Some(origin) if origin.as_bytes() != format!("http://{host}").as_bytes() => return Err(Refusal::Origin),
+            Some(origin) if !origin.to_str().is_ok_and(is_own) => return Err(Refusal::Origin),
             // Every browser sends the origin of a POST request.
             None if sends => return Err(Refusal::Origin),
             _ => {}
@@ -172,11 +178,20 @@ mod tests {
         assert_eq!(check(&local(), "/", &[]), Err(Refusal::Host));
         let twice = [("host", "localhost"), ("host", "localhost")];
         assert_eq!(check(&local(), "/", &twice), Err(Refusal::Host));
-        let own = [("host", "localhost:7979"), ("origin", "http://localhost:7979")];
-        assert_eq!(check(&local(), "/socket", &own), Ok(Entry::Plain));
+        for origin in ["http://localhost:7979", "https://localhost:7979"] {
+            let own = [("host", "localhost:7979"), ("origin", origin)];
+            assert_eq!(check(&local(), "/socket", &own), Ok(Entry::Plain), "{origin}");
+            // Of two schemes on one host, browsers call the other one another site.
+            let foreign = [own[0], own[1], ("sec-fetch-site", "cross-site")];
+            assert_eq!(check(&local(), "/socket", &foreign), Err(Refusal::Origin), "{origin}");
+        }
+        let rebound = [("host", "evil.example"), ("origin", "https://evil.example")];
+        assert_eq!(check(&local(), "/socket", &rebound), Err(Refusal::Host));
         for origin in [
             "http://localhost:3000",
-            "https://localhost:7979",
+            "https://localhost",
+            "wss://localhost:7979",
+            "localhost:7979",
             "null",
             "http://evil.example",
         ] {

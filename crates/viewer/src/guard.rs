@@ -11,7 +11,7 @@ use axum::http::header::{COOKIE, HOST, ORIGIN};
 use axum::http::{HeaderMap, Method, Uri};
 use std::net::IpAddr;
 
-/// Name of the cookie, and of the parameter in the address.
+/// Name of the parameter in the address.
 pub const TOKEN_NAME: &str = "token";
 /// Path to which pages send scenes.
 pub const UPLOAD_PATH: &str = "/merge/";
@@ -48,6 +48,7 @@ pub(crate) enum Entry {
 pub(crate) struct Guard {
     /// The host given by `--host`.
     pub host: String,
+    pub port: u16,
     /// `None` on loopback.
     pub token: Option<String>,
 }
@@ -94,11 +95,26 @@ impl Guard {
         let mut pairs = cookies
             .flat_map(|line| line.split(';'))
             .filter_map(|pair| pair.trim().split_once('='));
-        if pairs.any(|(name, value)| name == TOKEN_NAME && constant_time_eq(value, token)) {
+        let cookie_name = self.cookie_name();
+        if pairs.any(|(name, value)| name == cookie_name && constant_time_eq(value, token)) {
             Ok(Entry::Plain)
         } else {
             Err(Refusal::Token)
         }
+    }
+
+    /// Name of the cookie: browsers send the cookies of a host to all of its ports, where other viewers may be.
+    fn cookie_name(&self) -> String {
+        format!("{TOKEN_NAME}-{}", self.port)
+    }
+
+    /// The cookie that has the token; `None` on loopback.
+    pub fn cookie(&self) -> Option<String> {
+        let token = self.token.as_ref()?;
+        Some(format!(
+            "{}={token}; HttpOnly; SameSite=Strict; Path=/",
+            self.cookie_name()
+        ))
     }
 
     /// Whether `host`, with or without a port, names this server. The port may be that of a tunnel.
@@ -150,6 +166,7 @@ mod tests {
     fn local() -> Guard {
         Guard {
             host: "127.0.0.1".into(),
+            port: 7979,
             token: None,
         }
     }
@@ -229,6 +246,7 @@ mod tests {
     fn beyond_loopback_the_token_is_needed_and_a_name_must_be_asked_for() {
         let guard = Guard {
             host: "box".into(),
+            port: 7979,
             token: Some("0123abcd".into()),
         };
         let host = ("host", "10.0.0.7:7979");
@@ -236,13 +254,13 @@ mod tests {
         assert_eq!(check(&guard, "/?token=0123abcc", &[host]), Err(Refusal::Token));
         assert_eq!(check(&guard, "/?a=1&token=0123abcd", &[host]), Ok(Entry::ByAddress));
         assert_eq!(
-            check(&guard, "/", &[host, ("cookie", "a=b; token=0123abcd")]),
+            check(&guard, "/", &[host, ("cookie", "token-7980=4567; token-7979=0123abcd")]),
             Ok(Entry::Plain)
         );
-        assert_eq!(
-            check(&guard, "/", &[host, ("cookie", "token=0123abcd0")]),
-            Err(Refusal::Token)
-        );
+        for cookie in ["token-7979=0123abcd0", "token-7980=0123abcd"] {
+            let refused = check(&guard, "/", &[host, ("cookie", cookie)]);
+            assert_eq!(refused, Err(Refusal::Token), "{cookie}");
+        }
         assert_eq!(
             check(&guard, "/?token=0123abcd", &[("host", "box:7979")]),
             Ok(Entry::ByAddress)

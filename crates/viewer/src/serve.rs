@@ -3,7 +3,7 @@
 use crate::compact::compact_in_order;
 use crate::draw::encode;
 use crate::editing::stem_of;
-use crate::guard::{Entry, Guard, TOKEN_NAME, UPLOAD_PATH, random_token};
+use crate::guard::{Entry, Guard, UPLOAD_PATH, random_token};
 use crate::importance::by_importance;
 use crate::message::MAX_REQUEST;
 use crate::notices::Notices;
@@ -164,8 +164,8 @@ async fn guarded(State(shared): App, request: Request, next: Next) -> Response {
         .entry(CACHE_CONTROL)
         .or_insert(HeaderValue::from_static("no-store"));
     if entry == Ok(Entry::ByAddress)
-        && let Some(token) = &shared.guard.token
-        && let Ok(cookie) = HeaderValue::from_str(&format!("{TOKEN_NAME}={token}; HttpOnly; SameSite=Strict; Path=/"))
+        && let Some(cookie) = shared.guard.cookie()
+        && let Ok(cookie) = HeaderValue::try_from(cookie)
     {
         headers.insert(SET_COOKIE, cookie);
     }

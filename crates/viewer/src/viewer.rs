@@ -55,6 +55,7 @@ impl Viewer {
         }
         let guard = Guard {
             host: listen.host.clone(),
+            port: bound.port(),
             token,
         };
         let shared = Arc::new(Shared::new(subject, guard, notices.clone()).map_err(refused)?);

@@ -222,10 +222,24 @@ fn beyond_loopback_the_token_is_needed() {
         cookie.contains("HttpOnly") && cookie.contains("SameSite=Strict"),
         "{cookie}"
     );
-    assert_eq!(
-        served.status("/page/js/main.js", &[&host, &format!("Cookie: token={token}")]),
-        200
-    );
+    let sent = cookie.split_once(": ").and_then(|(_, value)| value.split(';').next());
+    let sent = format!("Cookie: {}", sent.expect("a value"));
+    assert_eq!(served.status("/page/js/main.js", &[&host, &sent]), 200);
+    // A browser sends both cookies to both ports of a host.
+    let other = serve("0.0.0.0");
+    let (_, token) = other.viewer.address().split_once("token=").expect("a token");
+    let host = other.host();
+    let second = other.get(&format!("/?token={token}"), &[&host]);
+    let name = |head: &str| {
+        head.lines().find_map(|line| {
+            line.to_lowercase()
+                .strip_prefix("set-cookie: ")?
+                .split('=')
+                .next()
+                .map(str::to_owned)
+        })
+    };
+    assert!(name(&first).is_some() && name(&first) != name(&second));
 }
 
 #[test]

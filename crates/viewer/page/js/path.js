@@ -39,6 +39,21 @@ const worldFromPhotographs = () => state.get("scene")?.world_from_photographs ??
 /** @param {number} t eased in and out: the smooth step of degree 3 */
 const eased = (t) => t * t * (3 - 2 * t);
 
+/** Why a saved path cannot be read; null if it can. @param {any} saved @returns {string | null} */
+function faultOf(saved) {
+  const within = (/** @type {any} */ value, /** @type {number} */ low, /** @type {number} */ high) => Number.isFinite(value) && value >= low && value <= high;
+  const numbers = (/** @type {any} */ values, /** @type {number} */ count) => Array.isArray(values) && values.length === count && values.every(Number.isFinite);
+  const isPlaced = (/** @type {any} */ key) => numbers(key?.position, 3) && numbers(key?.rotation, 4) && key.rotation.some(Boolean);
+  if (saved?.irradia_path !== 1) return "it is not one that this page saved";
+  const { keys, fps, loop, ease, closing } = saved;
+  if (!Array.isArray(keys) || keys.length === 0 || !keys.every(isPlaced)) return "there are no key frames, or one has no valid pose";
+  if (!keys.every(({ fov }) => within(fov, 1e-6, Math.PI - 1e-6))) return "a field of view is not between 0 and pi";
+  if (keys[0].time !== 0 || !keys.every(({ time }, i) => within(time, keys[Math.max(i - 1, 0)].time, 1e6))) return "the times of key frames do not begin at 0, or decrease";
+  if (!within(fps, 0.1, 240) || !within(closing, 0, 1e6)) return "frames per second are not 0.1 to 240, or closing is not 0 to 1,000,000 seconds";
+  if (typeof loop !== "boolean" || typeof ease !== "boolean") return "loop or ease is neither true nor false";
+  return null;
+}
+
 class Path extends EventTarget {
   /** @type {Key[]} in order of time, from 0 */
   keys = [];
@@ -120,14 +135,11 @@ class Path extends EventTarget {
 
   /** Reads what toJSON wrote. @param {any} saved */
   read(saved) {
-    const fits = (/** @type {any} */ key) =>
-      [key?.time, key?.fov, ...(key?.position ?? [null]), ...(key?.rotation ?? [null])].every(Number.isFinite) &&
-      key.position.length === 3 && key.rotation.length === 4;
-    if (saved?.irradia_path !== 1 || !Array.isArray(saved.keys) || !saved.keys.every(fits)) throw new Error("This is not a camera path of Irradia");
+    const fault = faultOf(saved);
+    if (fault) throw new Error(`This camera path cannot be opened: ${fault}`);
     const world = worldFromPhotographs();
     this.keys = saved.keys.map((/** @type {Key} */ { time, position, rotation, fov }) => placedCamera(world, { time, position, rotation, fov }));
-    this.keys.sort((a, b) => a.time - b.time);
-    [this.fps, this.loop, this.ease, this.closing] = [saved.fps ?? 30, Boolean(saved.loop), Boolean(saved.ease), saved.closing ?? 2];
+    [this.fps, this.loop, this.ease, this.closing] = [saved.fps, saved.loop, saved.ease, saved.closing];
     this.changed();
   }
 }

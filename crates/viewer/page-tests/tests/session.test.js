@@ -345,6 +345,63 @@ test("the preview of a path ends when the camera is moved", async () => {
   await server.stop();
 });
 
+test("key frames are moved in time by pointer and keyboard, and a camera path that is not one is refused in a line", async () => {
+  const server = await serve("view", trained(), "--port", "0");
+  const { page, problems } = await open(browser, server.address, { width: 800, height: 600 });
+  await set(page, { drawing: "served", sidebar: true, tab: "path" });
+  const saved = await page.evaluate(async () => {
+    const [{ path }, { state }] = await Promise.all(["path", "state"].map((name) => import(`/page/js/${name}.js`)));
+    for (let i = 0; i < 3; i += 1) path.add(state.get("camera"));
+    return JSON.stringify(path);
+  });
+  const times = () => page.evaluate(async () => (await import("/page/js/path.js")).path.keys.map(({ time }) => time));
+  const mark = (number) => page.getByRole("button", { name: `Key frame ${number} at` });
+  const dragTo = async (number, share) => {
+    const [track, box] = [await page.locator("irr-timeline .track").boundingBox(), await mark(number).boundingBox()];
+    await page.mouse.move(box.x + box.width / 2, box.y + box.height / 2);
+    await page.mouse.down();
+    await page.mouse.move(track.x + share * track.width, track.y, { steps: 5 });
+    await page.mouse.up();
+  };
+  const camera = { ...(await get(page, "camera")), fov: 0.5 };
+  await set(page, { camera });
+  const near = async (expected) => {
+    const found = await times();
+    assert.ok(found.every((time, i) => Math.abs(time - expected[i]) < 0.03), `${found} are not ${expected}`);
+  };
+  await dragTo(2, 0.75);
+  await near([0, 3, 4]);
+  assert.equal((await get(page, "camera")).fov, 0.5, "a drag is no click");
+  await dragTo(3, 0.1);
+  await near([0, 3, 3.1]);
+  await dragTo(1, 0.5);
+  await near([0, 3, 3.1]);
+  await mark(2).focus();
+  for (const key of ["ArrowLeft", "Shift+ArrowLeft"]) await page.keyboard.press(key);
+  await near([0, 1.9, 3.1]);
+  await page.keyboard.press("Delete");
+  await near([0, 3.1]);
+  assert.ok(await mark(2).evaluate((mark) => mark === document.activeElement));
+  await mark(2).click();
+  await until(page, async () => (await import("/page/js/state.js")).state.get("camera").fov !== 0.5);
+
+  const file = page.locator("irr-path-panel input[type=file]");
+  const read = (text) => file.setInputFiles({ name: "path.json", mimeType: "application/json", buffer: Buffer.from(text) });
+  for (const [from, to, says] of [
+    [/"fps":30/, '"fps":"30"', "frames per second"], [/"position":\[[^\]]*\]/, '"position":7', "no valid pose"], [/"time":0/, '"time":1', "begin at 0"],
+    [/"fov":[^,}]*/, '"fov":4', "field of view"], [/"loop":false/, '"loop":null', "loop or ease"], [/.*/, "null", "not one that"], [/.*/, "nonsense", "not JSON"],
+  ]) {
+    assert.match(saved, from);
+    await read(saved.replace(from, to));
+    await page.locator("irr-stage .chip").getByText(says).waitFor();
+  }
+  await near([0, 3.1]);
+  await read(saved);
+  await until(page, async () => (await import("/page/js/path.js")).path.keys.length === 3);
+  assert.deepEqual(problems, []);
+  await server.stop();
+});
+
 test("an address holds the camera", async () => {
   const server = await serve("view", trained(), "--port", "0");
   const { page } = await open(browser, server.address, { width: 500, height: 400 });

@@ -14,6 +14,8 @@ import { state } from "./state.js";
 
 /** Initial time between key frames, seconds. */
 export const KEY_INTERVAL = 2;
+/** Time between key frames below which they cannot be moved, seconds. */
+const MIN_INTERVAL = 0.1;
 
 /** Logarithm of a unit quaternion: axis times half the angle. @param {Quat} q @returns {Vec3} */
 function log([w, x, y, z]) {
@@ -74,6 +76,23 @@ class Path extends EventTarget {
   add({ position, rotation, fov }) {
     const last = this.keys[this.keys.length - 1];
     this.keys.push({ time: last ? last.time + KEY_INTERVAL : 0, position, rotation, fov });
+    this.changed();
+  }
+
+  /** Moves a key frame in time, between its neighbours; the first one stays at 0. @param {number} index @param {number} seconds */
+  move(index, seconds) {
+    if (index === 0) return;
+    const [low, high] = [this.keys[index - 1].time + MIN_INTERVAL, (this.keys[index + 1]?.time ?? Infinity) - MIN_INTERVAL];
+    if (low > high) return;
+    this.keys[index].time = clamp(Math.round(100 * seconds) / 100, low, high);
+    this.changed();
+  }
+
+  /** Removes a key frame; the path begins with the first of the others. @param {number} index */
+  remove(index) {
+    this.keys.splice(index, 1);
+    const first = this.keys[0]?.time ?? 0;
+    for (const key of this.keys) key.time -= first;
     this.changed();
   }
 

@@ -2,21 +2,31 @@
 
 import { clock, el } from "./dom.js";
 import { icon } from "./icons.js";
+import { CLICK_DISTANCE } from "./navigation.js";
 import { path } from "./path.js";
 import { state } from "./state.js";
+
+/** Seconds by which an arrow key moves a key frame; with Shift, tenfold. */
+const ARROW_STEP = 0.1;
 
 class Timeline extends HTMLElement {
   seconds = 0;
   playing = false;
   /** The camera that was shown last. @type {import("./camera.js").Camera | null} */
   camera = null;
+  /** The marks of the key frames. They stay when times change, and with them the focus and the pointer that drags one.
+   * @type {HTMLButtonElement[]} */
+  marks = [];
+  /** The dragged key frame: where the pointer went down, the time and the length of the path then, and whether it has moved.
+   * @type {{ index: number, x: number, time: number, total: number, moved: boolean } | null} */
+  drag = null;
 
   connectedCallback() {
     this.setAttribute("role", "group");
     this.setAttribute("aria-label", "Camera path");
     this.play = el("button", { type: "button", className: "icon", "aria-label": "Play the path (space)", onclick: () => this.toggle() }, icon("play"));
     this.head = el("div", { className: "head" });
-    this.track = el("div", { className: "track" });
+    this.track = el("div", { className: "track" }, this.head);
     this.time = el("span", { className: "quiet" });
     this.append(this.play, this.track, this.time);
     this.track.addEventListener("pointerdown", (event) => this.seek(event));
@@ -31,32 +41,78 @@ class Timeline extends HTMLElement {
   show() {
     this.hidden = !path.shown || path.keys.length === 0;
     if (this.hidden || path.keys.length < 2) this.playing = false;
-    const total = Math.max(path.seconds, 1e-6);
-    const keys = path.keys.map((key, index) => {
-      const mark = el("button", { type: "button", className: "key", title: `Key frame at ${key.time.toFixed(1)} s; delete removes it`, "aria-label": `Key frame ${index + 1}` });
-      mark.style.left = `${(100 * key.time) / total}%`;
-      mark.onclick = () => state.set({ camera: { position: key.position, rotation: key.rotation, fov: key.fov }, view: null });
-      mark.addEventListener("pointerdown", (event) => event.stopPropagation());
-      mark.addEventListener("keydown", (event) => {
-        if (event.key !== "Delete" && event.key !== "Backspace") return;
-        // Otherwise the key would delete the selection.
-        event.stopPropagation();
-        event.preventDefault();
-        path.keys.splice(index, 1);
-        const first = path.keys[0]?.time ?? 0;
-        for (const key of path.keys) key.time -= first;
-        path.changed();
-      });
-      return mark;
+    while (this.marks.length < path.keys.length) this.addMark(this.marks.length);
+    for (const mark of this.marks.splice(path.keys.length)) mark.remove();
+    path.keys.forEach(({ time }, index) => {
+      const mark = this.marks[index];
+      mark.style.left = this.left(time);
+      mark.setAttribute("aria-label", `Key frame ${index + 1} at ${time.toFixed(1)} s`);
+      mark.title = `Key frame at ${time.toFixed(1)} s: ${index ? "drag it or press an arrow key to move it, " : ""}Delete removes it`;
     });
-    if (this.head) this.track?.replaceChildren(...keys, this.head);
     this.tell();
   }
 
+  /** The place of a time on the track, whose scale stays while a key frame is dragged. @param {number} seconds */
+  left(seconds) {
+    return `${100 * Math.min(1, seconds / Math.max(this.drag?.total ?? path.seconds, 1e-6))}%`;
+  }
+
+  /** @param {number} index of the key frame */
+  addMark(index) {
+    const mark = el("button", { type: "button", className: "key" });
+    mark.addEventListener("pointerdown", (event) => {
+      event.stopPropagation();
+      if (event.button !== 0) return;
+      mark.setPointerCapture(event.pointerId);
+      this.drag = { index, x: event.clientX, time: path.keys[index].time, total: path.seconds, moved: false };
+    });
+    mark.addEventListener("pointermove", (event) => {
+      if (!this.drag) return;
+      event.stopPropagation();
+      this.dragTo(event.clientX);
+    });
+    mark.addEventListener("pointerup", () => this.drag?.moved === false && this.lookFrom(index));
+    mark.addEventListener("lostpointercapture", () => {
+      this.drag = null;
+      this.show();
+    });
+    // The click of a pointer comes after a drag, too.
+    mark.addEventListener("click", ({ detail }) => detail === 0 && this.lookFrom(index));
+    mark.addEventListener("keydown", (event) => this.keyMark(event, index));
+    this.marks.push(mark);
+    this.head?.before(mark);
+  }
+
+  /** @param {number} x of the pointer, CSS pixels */
+  dragTo(x) {
+    const { drag, track } = this;
+    if (!drag || !track) return;
+    drag.moved ||= Math.abs(x - drag.x) >= CLICK_DISTANCE;
+    if (drag.moved) path.move(drag.index, drag.time + ((x - drag.x) / track.clientWidth) * drag.total);
+  }
+
+  /** @param {KeyboardEvent} event @param {number} index of the key frame */
+  keyMark(event, index) {
+    const by = { ArrowLeft: -ARROW_STEP, ArrowRight: ARROW_STEP }[event.key];
+    if (!by && event.key !== "Delete" && event.key !== "Backspace") return;
+    // Otherwise the key would move the camera or delete the selection.
+    event.stopPropagation();
+    event.preventDefault();
+    this.drag = null;
+    if (by) return path.move(index, path.keys[index].time + by * (event.shiftKey ? 10 : 1));
+    path.remove(index);
+    this.marks[Math.min(index, this.marks.length - 1)]?.focus();
+  }
+
+  /** Shows the camera of a key frame. @param {number} index */
+  lookFrom(index) {
+    const { position, rotation, fov } = path.keys[index];
+    state.set({ camera: { position, rotation, fov }, view: null });
+  }
+
   tell() {
-    const total = path.seconds;
-    if (this.head) this.head.style.left = `${(100 * Math.min(this.seconds, total)) / Math.max(total, 1e-6)}%`;
-    if (this.time) this.time.textContent = `${clock(this.seconds)} / ${clock(total)}`;
+    if (this.head) this.head.style.left = this.left(this.seconds);
+    if (this.time) this.time.textContent = `${clock(this.seconds)} / ${clock(path.seconds)}`;
     this.play?.replaceChildren(icon(this.playing ? "pause" : "play"));
   }
 

@@ -194,6 +194,7 @@ test("a live training is paused, stepped, resumed and left alone, and its bytes 
   await until(page, async () => (await import("/page/js/state.js")).state.get("train")?.phase === "paused");
   const step = (await get(page, "train")).step;
   assert.ok(step > 0 && step < 1500);
+  assert.match(await page.title(), new RegExp(`^${Math.floor(step / 15)} % · .*live · Irradia$`));
   const second = await open(browser, server.address, { width: 400, height: 300 });
   await page.getByRole("button", { name: "Save now" }).click();
   await until(page, async (step) => (await import("/page/js/state.js")).state.get("train").saved === step, step);
@@ -212,6 +213,7 @@ test("a live training is paused, stepped, resumed and left alone, and its bytes 
   // Closing a page has no effect on the other one, which sees the scene improve.
   await second.page.close();
   await until(page, async () => (await import("/page/js/state.js")).state.get("train").phase === "finished");
+  assert.match(await page.title(), /^[^%]*live · Irradia$/);
   await sharp(page);
   assert.ok(psnr(before, await picture(page)) < 45, "the scene has changed");
   assert.ok((await get(page, "train")).curve.length > 100);

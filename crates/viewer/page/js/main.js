@@ -19,9 +19,11 @@ state.watch(["theme"], () => {
   else document.documentElement.dataset.theme = matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark";
 });
 
-state.watch(["hello"], () => {
-  const hello = state.get("hello");
-  if (hello) document.title = `${hello.title} · Irradia`;
+state.watch(["hello", "train"], () => {
+  const [hello, train] = [state.get("hello"), state.get("train")];
+  if (!hello) return;
+  const progress = train && train.phase !== "finished" ? `${Math.floor((100 * train.step) / Math.max(train.total, 1))} % · ` : "";
+  document.title = `${progress}${hello.title} · Irradia`;
 });
 
 // The event of the server's scene comes after this one.

@@ -9,6 +9,7 @@ use crate::serve::{Shared, router};
 use crate::{Subject, ViewerError};
 use serde_json::json;
 use std::fmt::Display;
+use std::net::TcpListener;
 use std::sync::Arc;
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
@@ -41,6 +42,9 @@ impl Viewer {
         let notices = Arc::new(Notices::new(sink));
         let listener = listen.bind()?;
         let bound = listener.local_addr().map_err(refused)?;
+        if listen.port != 0 && bound.port() != listen.port {
+            notices.report(format_args!("port {} is taken: using {}", listen.port, bound.port()));
+        }
         let token = if bound.ip().is_loopback() {
             None
         } else {
@@ -50,74 +54,19 @@ impl Viewer {
             .as_ref()
             .map_or(String::new(), |token| format!("?{TOKEN_NAME}={token}"));
         let address = format!("http://{}/{query}", reachable(bound));
-        if listen.port != 0 && bound.port() != listen.port {
-            notices.report(format_args!("port {} is taken: using {}", listen.port, bound.port()));
-        }
         let guard = Guard {
             host: listen.host.clone(),
             port: bound.port(),
             token,
         };
-        let shared = Arc::new(Shared::new(subject, guard, notices.clone()).map_err(refused)?);
-        if let Some(live) = &shared.subject.live {
-            let weak = Arc::downgrade(&shared);
-            let wake = move || {
-                if let Some(shared) = weak.upgrade() {
-                    shared.scheduler.wake();
-                }
-            };
-            // A subject is shown by one viewer.
-            let _ = live.on_change.set(Box::new(wake));
-        }
+        let shared = Arc::new(Shared::new(subject, guard, notices).map_err(refused)?);
+        wake_on_change(&shared);
         let closing = Arc::new(Notify::new());
-        // Separate threads: a training keeps its pool, and the system shares the processor between both.
-        let pool = rayon::ThreadPoolBuilder::new()
-            .num_threads(rayon::current_num_threads())
-            .thread_name(|i| format!("draw-{i}"))
-            .build()
-            .map_err(refused)?;
-        let runtime = tokio::runtime::Builder::new_current_thread()
-            .enable_all()
-            .max_blocking_threads(4)
-            .build()
-            .map_err(refused)?;
-        let serving = {
-            let (router, closing) = (router(shared.clone()), closing.clone());
-            move || {
-                if let Err(error) = runtime.block_on(accept(listener, router, notices.clone(), closing)) {
-                    notices.report(format_args!("the viewer has stopped: {error}"));
-                }
-                // Photographs that are being decoded must not delay the end.
-                runtime.shutdown_background();
-            }
-        };
-        let drawing = {
-            let shared = shared.clone();
-            move || pool.install(|| draw(&shared.subject, &shared.scheduler))
-        };
-        let editing = {
-            // In the program's global pool: only finished scenes are edited.
-            let shared = shared.clone();
-            move || {
-                let Ok(editing) = &shared.subject.editing else { return };
-                let tell = |client, line: &str| {
-                    let message = json!({ "tell": "problem", "text": line });
-                    shared.scheduler.send_text(client, message.to_string());
-                };
-                if let Some(line) = run_editing(editing, &shared.subject, &tell, &|| shared.scheduler.wake()) {
-                    shared.notices.report(format_args!("{line}"));
-                }
-            }
-        };
-        let begin = |name: &str, run: Box<dyn FnOnce() + Send>| {
-            let thread = thread::Builder::new().name(name.into());
-            thread.spawn(run).map_err(refused)
-        };
         let viewer = Self {
             threads: vec![
-                begin("serve", Box::new(serving))?,
-                begin("draw", Box::new(drawing))?,
-                begin("edit", Box::new(editing))?,
+                spawn("serve", serving(&shared, listener, closing.clone())?)?,
+                spawn("draw", drawing(&shared)?)?,
+                spawn("edit", editing(&shared))?,
             ],
             shared,
             address,
@@ -159,6 +108,72 @@ impl Viewer {
             if self.is_watched() {
                 seen = Instant::now();
             }
+        }
+    }
+}
+
+/// Wakes the drawing thread whenever the scene of a training may have changed.
+fn wake_on_change(shared: &Arc<Shared>) {
+    let Some(live) = &shared.subject.live else { return };
+    let weak = Arc::downgrade(shared);
+    let wake = move || {
+        if let Some(shared) = weak.upgrade() {
+            shared.scheduler.wake();
+        }
+    };
+    // A subject is shown by one viewer.
+    let _ = live.on_change.set(Box::new(wake));
+}
+
+fn spawn(name: &str, run: impl FnOnce() + Send + 'static) -> Result<JoinHandle<()>, ViewerError> {
+    let thread = thread::Builder::new().name(name.into());
+    thread.spawn(run).map_err(refused)
+}
+
+/// What the serving thread does, until `closing`.
+fn serving(
+    shared: &Arc<Shared>,
+    listener: TcpListener,
+    closing: Arc<Notify>,
+) -> Result<impl FnOnce() + Send + use<>, ViewerError> {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .max_blocking_threads(4)
+        .build()
+        .map_err(refused)?;
+    let (router, notices) = (router(shared.clone()), shared.notices.clone());
+    Ok(move || {
+        if let Err(error) = runtime.block_on(accept(listener, router, notices.clone(), closing)) {
+            notices.report(format_args!("the viewer has stopped: {error}"));
+        }
+        // Photographs that are being decoded must not delay the end.
+        runtime.shutdown_background();
+    })
+}
+
+/// What the drawing thread does, until the scheduler closes.
+fn drawing(shared: &Arc<Shared>) -> Result<impl FnOnce() + Send + use<>, ViewerError> {
+    // A separate pool: a training keeps its own, and the system shares the processor between both.
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(rayon::current_num_threads())
+        .thread_name(|i| format!("draw-{i}"))
+        .build()
+        .map_err(refused)?;
+    let shared = shared.clone();
+    Ok(move || pool.install(|| draw(&shared.subject, &shared.scheduler)))
+}
+
+/// What the editing thread does, until the session closes: in the program's global pool, since only finished scenes are edited.
+fn editing(shared: &Arc<Shared>) -> impl FnOnce() + Send + use<> {
+    let shared = shared.clone();
+    move || {
+        let Ok(editing) = &shared.subject.editing else { return };
+        let tell = |client, line: &str| {
+            let message = json!({ "tell": "problem", "text": line });
+            shared.scheduler.send_text(client, message.to_string());
+        };
+        if let Some(line) = run_editing(editing, &shared.subject, &tell, &|| shared.scheduler.wake()) {
+            shared.notices.report(format_args!("{line}"));
         }
     }
 }

@@ -2,7 +2,7 @@
 //! little endian), the header, a JPEG.
 
 use glam::{Quat, Vec3};
-use irradia_edit::{Edit, EditError, EditList, Operation, SelectStep};
+use irradia_edit::{Edit, EditError, EditList, Operation, SelectStep, Shape};
 use irradia_scene::{Camera, Intrinsics, Pose};
 use serde::{Deserialize, Serialize};
 
@@ -242,6 +242,31 @@ impl EditRequest {
         }
     }
 
+    /// Whether the request has positions or directions, which a page takes from the picture that it shows.
+    pub fn is_placed(&self) -> bool {
+        match self {
+            Self::Select { steps, .. } => steps.iter().any(|step| {
+                matches!(
+                    step.shape,
+                    Shape::Box { .. }
+                        | Shape::Sphere { .. }
+                        | Shape::HalfSpace { .. }
+                        | Shape::Polygon { .. }
+                        | Shape::Brush { .. }
+                )
+            }),
+            Self::Edit { edit, .. } => matches!(
+                edit,
+                Operation::Move { .. }
+                    | Operation::Rotate { .. }
+                    | Operation::Scale { .. }
+                    | Operation::SetLength { .. }
+                    | Operation::Upright { up: Some(_), .. }
+            ),
+            _ => false,
+        }
+    }
+
     /// Whether every number is in range.
     ///
     /// # Errors
@@ -277,7 +302,7 @@ impl EditRequest {
 /// Points that a step draws.
 fn points(step: &SelectStep) -> usize {
     match &step.shape {
-        irradia_edit::Shape::Polygon { points, .. } | irradia_edit::Shape::Brush { points, .. } => points.len(),
+        Shape::Polygon { points, .. } | Shape::Brush { points, .. } => points.len(),
         _ => 0,
     }
 }

@@ -116,9 +116,12 @@ impl Workspace {
     fn handle(&mut self, editing: &Editing, request: &EditRequest) -> Result<Option<String>, EditingError> {
         let session = &mut self.session;
         if self.before && !matches!(request, EditRequest::Compare { .. } | EditRequest::Save) {
-            // A selection drawn on the scene as it was opened may not fit the edited scene.
             self.before = false;
-            return Ok(Some("the edited scene is shown again: try again".to_owned()));
+            if request.is_placed() {
+                let line =
+                    "this was placed in the scene as it was opened: place it in the edited scene, which is shown again";
+                return Ok(Some(line.to_owned()));
+            }
         }
         match request.clone() {
             EditRequest::Select {

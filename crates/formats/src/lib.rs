@@ -48,7 +48,7 @@ pub use photos::{
 };
 pub use points_ply::{read_points_ply, write_points_ply};
 pub use splats::{
-    Quality, SogDetail, SplatFile, SplatFormat, SpzVersion, WriteOptions, encode_splats, is_sog_folder, parse_splats,
+    Quality, SogDetail, SplatFile, SplatFormat, SpzVersion, WriteOptions, encode_splats, is_sog_folder,
     read_splat_file, read_splats, round_trip, splat_file_size, write_splats, write_splats_with,
 };
 pub use tensors::{Tensor, read_tensors};

@@ -334,8 +334,9 @@ fn open_scene(file: &str, path: &Path) -> Result<SplatFile, String> {
     read_splat_file(&path).map_err(|error| error.to_string())
 }
 
-/// What was left out of the merged scene `file`, and whether its splats look different in a scene that is `antialiased` or not.
-fn merge_notes(file: &str, other: &SplatFile, antialiased: bool) -> Vec<String> {
+/// What was left out of the merged scene `file`, and whether its splats look different in a scene that is `antialiased` or not; a line
+/// each.
+pub fn merge_notes(file: &str, other: &SplatFile, antialiased: bool) -> Vec<String> {
     let difference = match (other.cloud.antialiased, antialiased) {
         (true, false) => Some("with Mip-Splatting's filter, this scene without: its smallest splats become too opaque"),
         (false, true) => {

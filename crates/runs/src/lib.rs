@@ -73,7 +73,7 @@ pub use cameras::{camera_names, is_moved, moved_from_dataset, moved_from_run, wr
 pub use compact::{CompactEvent, CompactInput, CompactTarget, Compacted, compact};
 pub use convert::{COMPARED_VIEWS, Conversion, convert};
 pub use describe::describe;
-pub use edit::{AppliedEdit, EDITS, Editing};
+pub use edit::{AppliedEdit, EDITS, Editing, merge_notes};
 pub use error::RunError;
 pub use evaluate::{
     NOT_MEASURED, distinct, evaluate, file_stem, file_stems, leave_out_unreadable, psnr_8_bits, unmeasured,

@@ -257,6 +257,39 @@ pub struct SplatFile {
 }
 
 impl SplatFile {
+    /// The splats in the bytes of a single file; a `.ply` may be compressed. Splats that cannot be drawn are left out.
+    ///
+    /// # Errors
+    /// When the format cannot be read, or the bytes are damaged or refer to another file.
+    pub fn parse(format: SplatFormat, bytes: &[u8]) -> Result<Self, Malformed> {
+        let cloud = parse(format, bytes)?;
+        Ok(match format {
+            SplatFormat::Ply | SplatFormat::CompressedPly | SplatFormat::PointsPly => {
+                let format = if ply::is_compressed(bytes) {
+                    SplatFormat::CompressedPly
+                } else {
+                    SplatFormat::Ply
+                };
+                Self {
+                    unread: ply::unread_properties(bytes),
+                    ..Self::of(format, cloud)
+                }
+            }
+            _ => Self::of(format, cloud),
+        })
+    }
+
+    /// Leaves out the splats of `cloud` that cannot be drawn.
+    fn of(format: SplatFormat, mut cloud: GaussianCloud) -> Self {
+        let left_out = rows::remove_invalid(&mut cloud);
+        Self {
+            format,
+            cloud,
+            left_out,
+            unread: Vec::new(),
+        }
+    }
+
     /// What the user should know about the file, one line each.
     pub fn warnings(&self) -> Vec<String> {
         let left_out = (self.left_out > 0).then(|| left_out_message(self.left_out));
@@ -282,33 +315,19 @@ pub fn read_splats(path: &Path) -> Result<GaussianCloud, FormatError> {
 /// # Errors
 /// The same.
 pub fn read_splat_file(path: &Path) -> Result<SplatFile, FormatError> {
-    let mut format = SplatFormat::of_existing(path)?;
-    let mut unread = Vec::new();
-    let mut cloud = match format {
-        SplatFormat::Ply | SplatFormat::CompressedPly | SplatFormat::PointsPly => read_and_parse(path, |bytes| {
-            unread = ply::unread_properties(bytes);
-            format = if ply::is_compressed(bytes) {
-                SplatFormat::CompressedPly
-            } else {
-                SplatFormat::Ply
-            };
-            parse(format, bytes)
-        })?,
-        SplatFormat::SogFolder => sog::read_folder(&sog_meta(path))?,
-        SplatFormat::Gltf => read_and_parse(path, |text| {
-            gltf::parse_gltf(text, &|name| read_sibling_file(path, name))
-        })?,
+    let format = SplatFormat::of_existing(path)?;
+    match format {
+        SplatFormat::SogFolder => Ok(SplatFile::of(format, sog::read_folder(&sog_meta(path))?)),
+        SplatFormat::Gltf => {
+            let cloud = read_and_parse(path, |text| {
+                gltf::parse_gltf(text, &|name| read_sibling_file(path, name))
+            })?;
+            Ok(SplatFile::of(format, cloud))
+        }
         // Refused before the file is read.
-        SplatFormat::Npz => return Err(FormatError::malformed(path, "NumPy archives are written, not read")),
-        _ => read_and_parse(path, |bytes| parse(format, bytes))?,
-    };
-    let left_out = rows::remove_invalid(&mut cloud);
-    Ok(SplatFile {
-        format,
-        cloud,
-        left_out,
-        unread,
-    })
+        SplatFormat::Npz => Err(FormatError::malformed(path, "NumPy archives are written, not read")),
+        _ => read_and_parse(path, |bytes| SplatFile::parse(format, bytes)),
+    }
 }
 
 /// The splats in the bytes of a single file.
@@ -325,16 +344,6 @@ fn parse(format: SplatFormat, bytes: &[u8]) -> Result<GaussianCloud, Malformed> 
         }),
         SplatFormat::Npz => Err(Malformed("NumPy archives are written, not read".into())),
     }
-}
-
-/// The splats in the bytes of a single file; a `.ply` may be compressed. Splats that cannot be drawn are left out.
-///
-/// # Errors
-/// When the format cannot be read, or the bytes are damaged or refer to another file.
-pub fn parse_splats(format: SplatFormat, bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
-    let mut cloud = parse(format, bytes)?;
-    rows::remove_invalid(&mut cloud);
-    Ok(cloud)
 }
 
 /// The bytes of a splat file. A folder of SOG images becomes one archive.
@@ -373,11 +382,11 @@ pub fn round_trip(
         path: name.to_owned(),
         source,
     })?;
-    let read = parse_splats(format, &bytes).map_err(|source| FormatError::Malformed {
+    let read = SplatFile::parse(format, &bytes).map_err(|source| FormatError::Malformed {
         path: name.to_owned(),
         source,
     })?;
-    Ok((read, bytes.len()))
+    Ok((read.cloud, bytes.len()))
 }
 
 /// Whether the folder `path` is a scene of SOG images; other programs have files named `meta.json`, too.

@@ -7,7 +7,9 @@ use irradia_edit::{
     Draft, Edit, EditError, EditList, Mode, Operation, SelectStep, Selection, Shape, Transform, apply, apply_to,
     floater_scores, select,
 };
+use irradia_runs::merge_notes;
 use irradia_scene::{GaussianCloud, Similarity};
+use std::cell::RefCell;
 use std::sync::Arc;
 
 /// Maximum bytes of earlier states that are kept for an immediate undo; without a kept state, undo makes the edits again.
@@ -59,6 +61,8 @@ pub(crate) struct Session {
     scores: Option<(Arc<Draft>, Vec<f32>)>,
     /// Scenes to merge.
     uploads: Arc<Uploads>,
+    /// What the user should know about merged scenes, a line each.
+    notes: Vec<String>,
 }
 
 /// An entry in the form that pages list.
@@ -84,6 +88,7 @@ impl Session {
             before: None,
             scores: None,
             uploads,
+            notes: Vec::new(),
         }
     }
 
@@ -283,13 +288,21 @@ impl Session {
             *name = format!("part-{}", parts.count() + 1);
         }
         let mut draft = (*self.draft).clone();
-        let open = |file: &str| self.uploads.open(file);
+        let notes = RefCell::new(Vec::new());
+        let open = |file: &str| {
+            let other = self.uploads.open(file)?;
+            notes
+                .borrow_mut()
+                .extend(merge_notes(file, &other, self.draft.cloud.antialiased));
+            Ok(other.cloud)
+        };
         // What is selected need not be searched for again, which may take a minute.
         let applied = if edit.select.as_ref() == Some(&self.steps) {
             apply_to(&mut draft, &edit, &self.selected, &open)?
         } else {
             apply(&mut draft, &edit, &open)?
         };
+        self.notes.extend(notes.into_inner());
         self.before = Some((self.draft.clone(), self.steps.clone(), self.selected.clone()));
         let text = edit_text(&applied.edit.op, applied.selected, self.draft.len(), draft.len());
         self.push(gesture, text, EntryAction::Edit(applied.edit, applied.moved));
@@ -297,6 +310,16 @@ impl Session {
         self.steps = self.steps_at(self.position);
         self.selected = Arc::new(select(&self.draft, &self.steps)?);
         Ok(())
+    }
+
+    /// A scene to merge again.
+    fn open(&self, file: &str) -> Result<GaussianCloud, String> {
+        Ok(self.uploads.open(file)?.cloud)
+    }
+
+    /// What the user should know about the scenes that were merged since the last call, a line each.
+    pub fn take_notes(&mut self) -> Vec<String> {
+        std::mem::take(&mut self.notes)
     }
 
     fn check_capacity(&self, steps: &[SelectStep]) -> Result<(), EditError> {
@@ -403,7 +426,7 @@ impl Session {
             });
             let again: Vec<Edit> = self.edits().skip(made).cloned().collect();
             for edit in again {
-                if let Err(error) = apply(Arc::make_mut(&mut draft), &edit, &|file| self.uploads.open(file)) {
+                if let Err(error) = apply(Arc::make_mut(&mut draft), &edit, &|file| self.open(file)) {
                     self.position = previous;
                     return Err(error);
                 }
@@ -455,7 +478,7 @@ impl Session {
         };
         let mut draft = (**self.original()).clone();
         for edit in &edits[..=last] {
-            parts.extend(apply(&mut draft, edit, &|file| self.uploads.open(file))?.split);
+            parts.extend(apply(&mut draft, edit, &|file| self.open(file))?.split);
         }
         Ok(parts)
     }

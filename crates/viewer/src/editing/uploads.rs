@@ -2,8 +2,7 @@
 
 use super::EditingError;
 use irradia_edit::EditError;
-use irradia_runs::formats::{FormatError, SplatFormat, parse_splats, read_splats, write_atomic};
-use irradia_scene::GaussianCloud;
+use irradia_runs::formats::{FormatError, SplatFile, SplatFormat, read_splat_file, write_atomic};
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -14,7 +13,7 @@ const MAX_TOTAL_BYTES: usize = 1 << 30;
 
 struct Upload {
     bytes: Vec<u8>,
-    cloud: GaussianCloud,
+    scene: SplatFile,
 }
 
 /// The scenes that were sent, by name.
@@ -46,7 +45,7 @@ impl Uploads {
                 "{name}: this format cannot be merged: choose .ply or .sog"
             )));
         }
-        let cloud = parse_splats(format, &bytes).map_err(|source| FormatError::Malformed {
+        let scene = SplatFile::parse(format, &bytes).map_err(|source| FormatError::Malformed {
             path: path.clone(),
             source,
         })?;
@@ -68,8 +67,8 @@ impl Uploads {
                 "there is no room for more scenes: merge them with irradia edit".to_owned(),
             ));
         }
-        let splats = cloud.len();
-        files.insert(name.clone(), Upload { bytes, cloud });
+        let splats = scene.cloud.len();
+        files.insert(name.clone(), Upload { bytes, scene });
         Ok((name, splats))
     }
 
@@ -86,13 +85,13 @@ impl Uploads {
     ///
     /// # Errors
     /// When there is none, or the file cannot be read.
-    pub fn open(&self, name: &str) -> Result<GaussianCloud, String> {
+    pub fn open(&self, name: &str) -> Result<SplatFile, String> {
         let files = self.files.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(upload) = files.get(name) {
-            return Ok(upload.cloud.clone());
+            return Ok(upload.scene.clone());
         }
         drop(files);
-        read_splats(&self.sibling(name)?).map_err(|error| error.to_string())
+        read_splat_file(&self.sibling(name)?).map_err(|error| error.to_string())
     }
 
     /// Whether [`Self::open`] finds a scene.
@@ -153,6 +152,7 @@ fn sanitized(c: char) -> char {
 mod tests {
     use super::*;
     use irradia_runs::formats::encode_splats;
+    use irradia_scene::GaussianCloud;
 
     fn scene(opacity: f32) -> Vec<u8> {
         let cloud = GaussianCloud {
@@ -177,9 +177,9 @@ mod tests {
         assert_eq!(add("room.ply", 1.0), "room.ply");
         assert_eq!(add("room.ply", 2.0), "room-2.ply");
         assert_eq!(add("taken.ply", 1.0), "taken-2.ply");
-        assert_eq!(uploads.open("room-2.ply").unwrap().opacity_logits, [2.0]);
+        assert_eq!(uploads.open("room-2.ply").unwrap().cloud.opacity_logits, [2.0]);
         fs::write(folder.path().join("beside.ply"), scene(3.0)).unwrap();
-        assert_eq!(uploads.open("beside.ply").unwrap().opacity_logits, [3.0]);
+        assert_eq!(uploads.open("beside.ply").unwrap().cloud.opacity_logits, [3.0]);
         let within = format!("../{}/beside.ply", folder.path().file_name().unwrap().display());
         for name in ["/etc/passwd", "..", "", "absent.ply", within.as_str()] {
             assert!(uploads.open(name).unwrap_err().contains("has been sent"), "{name}");

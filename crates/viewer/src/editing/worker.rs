@@ -143,7 +143,8 @@ impl Workspace {
                 return Ok(Some(line));
             }
         }
-        Ok(None)
+        let notes = session.take_notes();
+        Ok((!notes.is_empty()).then(|| notes.join("; ")))
     }
 
     /// Updates what pages download, and the file of unsaved edits beside the scene.

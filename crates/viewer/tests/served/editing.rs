@@ -213,6 +213,38 @@ fn a_scene_that_a_page_sends_is_merged_saved_and_replayed() {
 }
 
 #[test]
+fn a_merged_scene_that_looks_different_is_reported() {
+    let served = serve("127.0.0.1");
+    let mut cloud = read_splats(served.scene()).expect("splats");
+    cloud.antialiased = true;
+    let sent = encode_splats(SplatFormat::Spz, &cloud, &Default::default()).expect("encoded");
+    served.send_scene("/merge/filtered.spz", &served.origin(), &sent);
+    let mut page = page(&served);
+    let merge = json!({ "do": "edit", "whole": true, "edit": { "op": "merge", "file": "filtered.spz" } });
+    let line = refusal(&mut page, &merge);
+    assert!(
+        line.starts_with("filtered.spz: trained with Mip-Splatting's filter"),
+        "{line}"
+    );
+}
+
+#[test]
+fn what_needs_no_place_is_done_while_the_scene_is_shown_as_it_was_opened() {
+    let served = serve("127.0.0.1");
+    let mut page = page(&served);
+    request_state(&mut page, &select_right_splat(), ("selected", json!(1)));
+    let compare = json!({ "do": "compare", "before": true });
+    request_state(&mut page, &compare, ("before", json!(true)));
+    let delete = json!({ "do": "edit", "edit": { "op": "delete" } });
+    let deleted = request_state(&mut page, &delete, ("at", json!(2)));
+    assert_eq!((&deleted["of"], &deleted["before"]), (&json!(2), &json!(false)));
+    request_state(&mut page, &compare, ("before", json!(true)));
+    assert!(refusal(&mut page, &select_right_splat()).contains("as it was opened"));
+    let shown = next_message(&mut page, "editing");
+    assert_eq!((&shown["at"], &shown["before"]), (&json!(2), &json!(false)));
+}
+
+#[test]
 fn a_download_needs_a_known_format_and_the_token() {
     let served = serve("127.0.0.1");
     let host = served.host();

@@ -1,5 +1,6 @@
 // Selection tools on the stage: what is drawn with the pointer becomes a step of the selection when the pointer is released.
 
+import { hasDialog } from "../dom.js";
 import { state } from "../state.js";
 import { ball, beside, brush, polygon } from "./shapes.js";
 import { session } from "./session.js";
@@ -67,7 +68,7 @@ export class Tools extends EventTarget {
     });
     state.addEventListener("camera", () => this.drawn && this.drawn.camera !== state.get("camera") && this.cancel());
     addEventListener("keydown", (event) => {
-      if (event.key === "Enter" && this.drawn?.tool === "polygon") this.finish();
+      if (event.key === "Enter" && !hasDialog() && this.drawn?.tool === "polygon") this.finish();
     });
   }
 

@@ -12,6 +12,8 @@ const ARROW_STEP = 0.1;
 class Timeline extends HTMLElement {
   seconds = 0;
   playing = false;
+  /** The next frame of the preview. */
+  request = 0;
   /** The camera that was shown last. @type {import("./camera.js").Camera | null} */
   camera = null;
   /** The marks of the key frames. They stay when times change, and with them the focus and the pointer that drags one.
@@ -130,9 +132,11 @@ class Timeline extends HTMLElement {
         else [this.seconds, this.playing] = [path.seconds, false];
       }
       this.look();
-      requestAnimationFrame(frame);
+      this.request = requestAnimationFrame(frame);
     };
-    requestAnimationFrame(frame);
+    // A preview that was ended since the last frame would go on beside this one.
+    cancelAnimationFrame(this.request);
+    this.request = requestAnimationFrame(frame);
   }
 
   /** @param {PointerEvent} event */

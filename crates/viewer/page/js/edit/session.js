@@ -13,6 +13,8 @@ import { state } from "../state.js";
 
 /** Maximum bytes of a request, as in message.rs: beyond it the server ends the connection. */
 const MAX_REQUEST = 16 * 2 ** 20;
+/** Maximum bytes of a scene to merge, as in serve.rs: while a larger one is sent, a browser does not read the reason of a refusal. */
+const MAX_SCENE = 2 ** 30;
 
 class Session {
   /** The latest gesture number; it starts at random, so that the gestures of two pages differ. */
@@ -87,6 +89,7 @@ class Session {
   /** Adds the splats of another scene. @param {File} file of any splat format */
   async merge(file) {
     try {
+      if (file.size > MAX_SCENE) throw new Error(`${file.name} is larger than 1 GiB: merge it with irradia edit`);
       const response = await fetch(`merge/${encodeURIComponent(file.name)}${location.search}`, { method: "POST", body: file });
       const text = await response.text();
       if (!response.ok) throw new Error(text);

@@ -77,6 +77,8 @@ test("a session begins where one is offered, and both eyes see the scene", async
   // Both eyes show something of the same brightness, from different positions.
   assert.ok(left > 10 && Math.abs(left / right - 1) < 0.2, `${left} ${right}`);
   assert.ok(between > 0.5 && between < left, `${between}`);
+  await page.evaluate(() => globalThis.headsetSession.dispatchEvent(new Event("end")));
+  await until(page, async () => document.querySelector("irr-stage").local.wanted.camera === (await import("/page/js/state.js")).state.get("camera"), null, 20);
   await server.stop();
 });
 

@@ -50,7 +50,8 @@ export async function enterXr(stage) {
     session.requestAnimationFrame(frame);
     session.addEventListener("end", () => {
       local.holdWebGl(false);
-      stage.dispatchEvent(new Event("drawing"));
+      // The last camera was that of an eye.
+      stage.dirty = true;
     });
   } catch (error) {
     local.holdWebGl(false);

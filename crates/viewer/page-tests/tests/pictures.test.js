@@ -65,6 +65,9 @@ for (const [name, make, least] of [["a field", field, 38], ["splats with a resid
       await sharp(page);
       assert.ok(psnr(shown, await picture(page)) < 25, `${mode} is no other picture`);
     }
+    // A field has no splats to count.
+    await page.keyboard.press("5");
+    assert.equal(await get(page, "mode"), make === field ? "depth" : "count");
     await server.stop();
   });
 }

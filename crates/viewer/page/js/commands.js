@@ -16,7 +16,9 @@ export const MODES = [
   ["count", "Splats per pixel", "5"], ["ellipses", "Ellipses", "6"], ["rings", "Rings", "7"], ["points", "Points", "8"],
 ];
 /** Modes that need splats. */
-export const SPLAT_MODES = ["count", "ellipses", "rings", "points"];
+const SPLAT_MODES = ["count", "ellipses", "rings", "points"];
+/** Whether the scene can be drawn in a mode. @param {string} mode */
+export const offersMode = (mode) => state.get("scene")?.kind !== "field" || !SPLAT_MODES.includes(mode);
 
 /** @returns {import("./stage.js").Stage} */
 export const stage = () => /** @type {any} */ (document.querySelector("irr-stage"));
@@ -80,7 +82,7 @@ export const COMMANDS = {
     { keys: "[", name: "Previous view", run: () => step(-1) },
   ],
   Picture: [
-    ...MODES.map(([mode, name, key]) => ({ keys: key, name, run: () => state.set({ mode }) })),
+    ...MODES.map(([mode, name, key]) => ({ keys: key, name, run: () => offersMode(mode) && state.set({ mode }) })),
     { keys: "c", name: "Compare with the photograph", run: () => {
       const next = /** @type {const} */ ({ none: "slider", slider: "blink", blink: "error", error: "none" });
       state.set({ compare: next[state.get("compare")] });

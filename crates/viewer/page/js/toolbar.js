@@ -1,6 +1,6 @@
 // <irr-toolbar>: what is drawn, the kind of navigation, and the page's buttons.
 
-import { COMMANDS, MODES, SPLAT_MODES, share, stage, toggleTheme } from "./commands.js";
+import { COMMANDS, MODES, offersMode, share, stage, toggleTheme } from "./commands.js";
 import { choose, el, press, segments, short } from "./dom.js";
 import { icon } from "./icons.js";
 import { state } from "./state.js";
@@ -40,7 +40,7 @@ class Toolbar extends HTMLElement {
       const size = scene ? ` · ${short(scene.count)} ${scene.kind === "field" ? "parameters" : scene.kind}` : "";
       title.textContent = hello ? `${hello.title}${size}` : "";
       title.title = title.textContent;
-      for (const option of modes.options) option.disabled = scene?.kind === "field" && SPLAT_MODES.includes(option.value);
+      for (const option of modes.options) option.disabled = !offersMode(option.value);
       drawing.options[2].disabled = Boolean(scene) && !scene?.travels;
     });
     state.watch(["mode"], () => (modes.value = state.get("mode")));

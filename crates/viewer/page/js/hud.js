@@ -23,7 +23,7 @@ class Hud extends HTMLElement {
     const owner = stage();
     const status = el("div", { className: "chip status" });
     const tool = el("div", { className: "chip", hidden: true, role: "status" });
-    const message = el("div", { className: "chip", hidden: true, role: "status" });
+    const message = el("div", { className: "chip message", hidden: true, role: "status" });
     const lost = el("div", { className: "chip lost", hidden: true, role: "alert" });
     const legend = el("div", { className: "chip legend", hidden: true });
     const compare = this.comparison();

@@ -133,6 +133,31 @@ test("a photograph that cannot be loaded is explained, and requested again", asy
   await server.stop();
 });
 
+test("the photograph of another view is not shown in place of one that is being loaded", async () => {
+  const server = await serve("view", trained(), "--port", "0");
+  const { page, problems } = await open(browser, server.address, { width: 500, height: 400 });
+  const opacity = () => page.locator("img.photo").evaluate((photo) => getComputedStyle(photo).opacity);
+  await set(page, { drawing: "served", view: 0, compare: "slider" });
+  await until(page, () => document.querySelector("img.photo").style.opacity === "1");
+  const held = new Promise((resolve) => page.route("**/view/1/photo?*", resolve));
+  await set(page, { view: 1 });
+  const route = await held;
+  assert.equal(await opacity(), "0");
+  await route.continue();
+  await until(page, () => document.querySelector("img.photo").style.opacity === "1");
+  assert.deepEqual(problems, []);
+  await server.stop();
+});
+
+test("a long message is whole on a narrow screen", async () => {
+  const server = await serve("view", trained(), "--port", "0");
+  const { page } = await open(browser, server.address, { width: 360, height: 740 });
+  await set(page, { problem: `cannot read ${"photographs/of/a/capture/".repeat(6)}a.png: it is damaged` });
+  const { left, right } = await page.getByText("cannot read").evaluate((chip) => chip.getBoundingClientRect().toJSON());
+  assert.ok(left >= 0 && right <= 360, `${left} to ${right}`);
+  await server.stop();
+});
+
 test("no key acts behind the sheet of keys", async () => {
   const server = await serve("view", trained(), "--port", "0");
   const { page } = await open(browser, server.address, { width: 900, height: 700 });

@@ -55,6 +55,7 @@ export class Stage extends HTMLElement {
     this.context = this.served.getContext("bitmaprenderer");
     this.drawn = el("div", { className: "local", hidden: true });
     this.photo = /** @type {HTMLImageElement} */ (el("img", { className: "photo", hidden: true, alt: "" }));
+    this.photo.onload = () => this.photo && (this.photo.style.opacity = "1");
     this.photo.onerror = () => this.losePhoto();
     this.overlay = /** @type {HTMLCanvasElement} */ (el("canvas", { className: "overlay", tabIndex: 0 }));
     this.overlay.setAttribute("role", "img");
@@ -327,7 +328,11 @@ export class Stage extends HTMLElement {
     clearInterval(this.blinking);
     if (!shows) return;
     const address = pictureOf(/** @type {number} */ (index), "photo");
-    if (this.photo.getAttribute("src") !== address) this.photo.src = address;
+    if (this.photo.getAttribute("src") !== address) {
+      // Until it is loaded, browsers show the one before it.
+      this.photo.style.opacity = "0";
+      this.photo.src = address;
+    }
     this.clipPhoto();
     this.photo.style.visibility = "visible";
     if (compare === "blink") {

@@ -147,6 +147,7 @@ impl<'a> Painter<'a> {
         let options = RenderOptions {
             background: shot.background.unwrap_or(scene.options.background),
             depth: shot.mode == Mode::Depth,
+            blend: !matches!(shot.mode, Mode::Count | Mode::Ellipses | Mode::Rings | Mode::Points),
             ..scene.options
         };
         let has_normals = shot.mode == Mode::Normals;
@@ -359,6 +360,10 @@ impl<'a> Painter<'a> {
                     highlight: false,
                     ..*shot
                 };
+                let options = RenderOptions {
+                    blend: false,
+                    ..scene.options
+                };
                 let altered = self.altered(edition, &plain, &whole);
                 let drawn = altered.as_ref().map_or(whole.splats, |(_, splats)| splats);
                 render_splats(
@@ -367,7 +372,7 @@ impl<'a> Painter<'a> {
                     None,
                     &mut self.renderer,
                     &shot.camera,
-                    &scene.options,
+                    &options,
                 );
                 self.altered = altered;
                 let hits = self.renderer.hits(x as u32, y as u32);

@@ -207,8 +207,12 @@ mod tests {
     use crate::{RenderOptions, Splats, ViewParams, logit};
     use irradia_scene::{Camera, Intrinsics, Pose, sh};
 
-    /// Two splats on the axis of a camera, the nearer one red with opacity 0.8, the farther one green with 0.5.
     fn rendered() -> Renderer {
+        rendered_with(&RenderOptions::default())
+    }
+
+    /// Two splats on the axis of a camera, the nearer one red with opacity 0.8, the farther one green with 0.5.
+    fn rendered_with(options: &RenderOptions) -> Renderer {
         let mut splats = Splats::zeros(2, 0);
         for (i, (z, opacity)) in [(2.0, 0.8), (3.0, 0.5)].into_iter().enumerate() {
             splats.means.plane_mut(2)[i] = z;
@@ -227,8 +231,29 @@ mod tests {
             Intrinsics::from_fov_x(41, 41, 1.0),
         );
         let mut renderer = Renderer::new();
-        renderer.render(&splats, &ViewParams::new(&camera), &RenderOptions::default());
+        renderer.render(&splats, &ViewParams::new(&camera), options);
         renderer
+    }
+
+    #[test]
+    fn nothing_need_be_blended() {
+        let (blended, binned) = (
+            rendered(),
+            rendered_with(&RenderOptions {
+                blend: false,
+                ..RenderOptions::default()
+            }),
+        );
+        assert!(binned.color().is_empty());
+        assert_eq!(binned.hits(20, 20), blended.hits(20, 20));
+        assert_eq!(binned.counts(), blended.counts());
+        for shape in [Shape::Ellipses, Shape::Rings, Shape::Points] {
+            assert_eq!(
+                binned.shapes(shape, [0.0; 3]),
+                blended.shapes(shape, [0.0; 3]),
+                "{shape:?}"
+            );
+        }
     }
 
     #[test]

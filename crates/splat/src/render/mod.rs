@@ -49,6 +49,9 @@ pub struct RenderOptions {
     pub antialias: bool,
     /// Fill [`Renderer::depth`].
     pub depth: bool,
+    /// Fill colour, alpha and depth at all: [`Renderer::hits`], [`Renderer::counts`] and [`Renderer::shapes`] need none of them. Without, they
+    /// are those of an earlier frame, and there is no [`Renderer::backward`].
+    pub blend: bool,
     /// Number of splats to draw, counted from the first and rounded up to a multiple of [`CHUNK`].
     pub first: usize,
 }
@@ -60,6 +63,7 @@ impl Default for RenderOptions {
             sh_degree: 3,
             antialias: false,
             depth: false,
+            blend: true,
             first: usize::MAX,
         }
     }
@@ -333,7 +337,7 @@ impl Renderer {
         }
     }
 
-    /// The second half of a frame: bins and blends the projected splats.
+    /// The second half of a frame: bins the projected splats, and blends them if requested.
     ///
     /// # Panics
     /// When nothing was projected.
@@ -341,7 +345,9 @@ impl Renderer {
         let view = self.view.clone().expect("projection comes first");
         let options = self.options;
         self.bins.build(&self.parts, &self.depth_keys);
-        self.blend(&view, &options);
+        if options.blend {
+            self.blend(&view, &options);
+        }
     }
 
     fn project_chunks(
@@ -482,9 +488,10 @@ impl Renderer {
     /// SH gradients are written for the bands in use; the others keep their values.
     ///
     /// # Panics
-    /// When nothing was rendered, sizes differ, or a depth gradient is given without a rendered depth.
+    /// When nothing was rendered or blended, sizes differ, or a depth gradient is given without a rendered depth.
     pub fn backward(&mut self, splats: &Splats, v_out: &OutputGradient, gradients: &mut SplatGradients) {
         let view = self.view.clone().expect("render comes first");
+        assert!(self.options.blend, "a frame that was blended");
         let pixels = view.width as usize * view.height as usize;
         assert_eq!(v_out.color.len(), 3 * pixels, "a colour gradient per pixel");
         assert!(

@@ -49,8 +49,8 @@ pub struct RenderOptions {
     pub antialias: bool,
     /// Fill [`Renderer::depth`].
     pub depth: bool,
-    /// Fill colour, alpha and depth at all: [`Renderer::hits`], [`Renderer::counts`] and [`Renderer::shapes`] need none of them. Without, they
-    /// are those of an earlier frame, and there is no [`Renderer::backward`].
+    /// Fill colour, alpha and depth at all: [`Renderer::hits`], [`Renderer::counts`] and [`Renderer::shapes`] need none of them.
+    /// Without, they are those of an earlier frame, and there is no [`Renderer::backward`].
     pub blend: bool,
     /// Number of splats to draw, counted from the first and rounded up to a multiple of [`CHUNK`].
     pub first: usize,

@@ -35,8 +35,8 @@ struct Workspace {
 /// The state that pages are told of a scene of `splats` splats before the first request.
 pub(super) fn initial_state(splats: usize) -> Value {
     json!({
-        "tell": "editing", "version": 1, "selected": 0, "of": splats, "hidden": 0, "locked": 0, "box": null, "at": 0, "first": 0, "total": 0,
-        "entries": [], "gesture": 0, "before": false, "busy": false, "mask": 0, "saved": null,
+        "tell": "editing", "version": 1, "selected": 0, "of": splats, "hidden": 0, "locked": 0, "box": null, "at": 0, "first": 0,
+        "total": 0, "entries": [], "gesture": 0, "before": false, "busy": false, "mask": 0, "saved": null,
     })
 }
 

@@ -5,7 +5,7 @@ use crate::{RunError, RunFolder};
 use glam::{DQuat, DVec3, Quat};
 use irradia_edit::Transform;
 use irradia_formats::write_atomic;
-use irradia_scene::{Camera, Dataset, Intrinsics, Pose, Similarity, View};
+use irradia_scene::{Camera, Dataset, Intrinsics, Pose, Similarity, View, with_f32_digits};
 use irradia_sfm::geometry::pose::DPose;
 use irradia_train::Trainer;
 use serde::{Deserialize, Serialize};
@@ -47,11 +47,6 @@ impl CameraRecord {
     }
 }
 
-/// An `f64` with the digits of an `f32`, so that files do not show digits beyond its precision.
-fn shortest(value: f32) -> f64 {
-    value.to_string().parse().unwrap_or(f64::from(value))
-}
-
 /// The content of `cameras.json`: the training views' cameras, with refined poses.
 pub(crate) fn cameras_json(trainer: &Trainer) -> Vec<u8> {
     let dataset = &trainer.dataset;
@@ -66,7 +61,7 @@ pub(crate) fn cameras_json(trainer: &Trainer) -> Vec<u8> {
             } = trainer.camera(*i);
             let q = pose.rotation;
             let position = if world.is_identity() {
-                pose.position.to_array().map(shortest)
+                pose.position.to_array().map(with_f32_digits)
             } else {
                 world.invert(pose.position.as_dvec3()).to_array()
             };

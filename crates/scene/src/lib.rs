@@ -13,6 +13,7 @@ pub mod base64;
 mod camera;
 mod cloud;
 mod dataset;
+mod digits;
 mod extra;
 pub mod half;
 mod image;
@@ -33,6 +34,7 @@ pub use cloud::GaussianCloud;
 pub use dataset::{
     Dataset, DepthGrid, Grid, GridSource, Kept, LoadError, NormalGrid, Photo, PhotoSource, View, every_eighth,
 };
+pub use digits::with_f32_digits;
 pub use extra::{ExtraColumn, Scalar};
 pub use image::Image;
 pub use lens::Lens;

@@ -5,7 +5,7 @@ use crate::splats::rows::{bounds, encode_rows, morton_order};
 use crate::splats::{SogDetail, WriteOptions};
 use crate::zip::Writer;
 use image_webp::{ColorType, EncoderParams, WebPEncoder};
-use irradia_scene::{GaussianCloud, sh};
+use irradia_scene::{GaussianCloud, sh, with_f32_digits};
 use rayon::prelude::*;
 use serde_json::json;
 use std::io::{self, Write};
@@ -144,11 +144,6 @@ pub(crate) fn encode(cloud: &GaussianCloud, options: &WriteOptions) -> io::Resul
     // Last, so that a folder with it is complete.
     files.push((META_FILE, serde_json::to_vec(&meta).map_err(io::Error::other)?));
     Ok(files)
-}
-
-/// An `f64` with the digits of an `f32`: otherwise half of the text would be digits beyond its precision.
-fn with_f32_digits(value: f32) -> f64 {
-    value.to_string().parse().unwrap_or(f64::from(value))
 }
 
 /// `value` rounded to a multiple of `2^bits`, at most `max`: the lowest bits are zero, and take no bytes.

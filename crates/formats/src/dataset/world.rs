@@ -1,7 +1,7 @@
 //! The world in which a dataset is trained: that of its files, unless positions or sizes are too large or too small for `f32`.
 
 use glam::DVec3;
-use irradia_scene::Similarity;
+use irradia_scene::{Similarity, median};
 
 /// Distance of the cameras' median from the origin above which the origin is moved there, in units of the median distance of a camera
 /// from that median. At this limit, neighbouring `f32` values are up to 1e-5 of these units apart: a hundredth of a pixel in most
@@ -15,9 +15,9 @@ const RADIUS_RANGE: [f64; 2] = [0.1, 50.0];
 /// of a camera from there is not within [`RADIUS_RANGE`], the unit is a power of ten of the files', such that this distance is 1 to 10
 /// units; constants in world units, like the near plane, then follow the scene's size. Medians, since one camera may be misplaced.
 pub(super) fn world_from_dataset(positions: &[DVec3]) -> Similarity {
-    let median_along = |axis: usize| median(positions.iter().map(|p| p[axis]).collect());
+    let median_along = |axis: usize| median(positions.iter().map(|p| p[axis]).collect()).unwrap_or(0.0);
     let center = DVec3::new(median_along(0), median_along(1), median_along(2));
-    let radius = median(positions.iter().map(|p| p.distance(center)).collect());
+    let radius = median(positions.iter().map(|p| p.distance(center)).collect()).unwrap_or(0.0);
     let keeps_units = radius == 0.0 || (RADIUS_RANGE[0]..=RADIUS_RANGE[1]).contains(&radius);
     let scale = if keeps_units {
         1.0
@@ -30,15 +30,6 @@ pub(super) fn world_from_dataset(positions: &[DVec3]) -> Similarity {
         center: if moves_origin { center } else { DVec3::ZERO },
     };
     if world.is_valid() { world } else { Similarity::IDENTITY }
-}
-
-/// The middle value; 0 if there is none.
-fn median(mut values: Vec<f64>) -> f64 {
-    let middle = values.len() / 2;
-    if values.is_empty() {
-        return 0.0;
-    }
-    *values.select_nth_unstable_by(middle, f64::total_cmp).1
 }
 
 #[cfg(test)]

@@ -4,12 +4,14 @@ use irradia_formats::parse;
 use libfuzzer_sys::fuzz_target;
 
 /// The smaller parsers of datasets; the first byte selects one.
-const PARSERS: [fn(&[u8]); 10] = [
+const PARSERS: [fn(&[u8]); 12] = [
     |text| drop(parse::bundle(text)),
+    |text| drop(parse::meshroom(text)),
     |text| drop(parse::metashape(text)),
     |text| drop(parse::nerfies_camera(text)),
     |text| drop(parse::nerfies_dataset(text)),
     |text| drop(parse::nvm(text)),
+    |text| drop(parse::openmvg(text)),
     |text| drop(parse::opensfm(text)),
     |text| drop(parse::polycam(text)),
     |text| drop(parse::realitycapture_csv(text)),

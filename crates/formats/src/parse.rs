@@ -6,8 +6,10 @@ pub use crate::dataset::colmap::{
     ColmapCamera, ColmapImage, ColmapPoint, binary as colmap_binary, text as colmap_text,
 };
 pub use crate::dataset::llff::{LlffPose, parse_poses_bounds as poses_bounds};
+pub use crate::dataset::meshroom::parse_meshroom as meshroom;
 pub use crate::dataset::nerfies::{parse_nerfies_camera as nerfies_camera, parse_nerfies_dataset as nerfies_dataset};
 pub use crate::dataset::nvm::parse_nvm as nvm;
+pub use crate::dataset::openmvg::parse_openmvg as openmvg;
 pub use crate::dataset::opensfm::parse_opensfm as opensfm;
 pub use crate::dataset::phone::{parse_polycam as polycam, parse_record3d as record3d};
 pub use crate::dataset::realitycapture::{

@@ -181,6 +181,23 @@ fn cases() -> Vec<Case> {
             |b| parse::opensfm(b).is_ok(),
         ),
         case(
+            "sfm_data.json",
+            br#"{"root_path": "", "views": [{"key": 0, "value": {"ptr_wrapper": {"data": {"filename": "a", "id_view": 0, "id_intrinsic": 0,
+            "id_pose": 0}}}}], "intrinsics": [{"key": 0, "value": {"ptr_wrapper": {"data": {"value0": {"value0": {"width": 9, "height": 9},
+            "focal_length": 9}, "disto_k1": [0.1]}}}}], "extrinsics": [{"key": 0, "value": {"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+            "center": [1, 2, 3]}}], "structure": [{"key": 0, "value": {"X": [1, 2, 3], "observations": [{"key": 0}]}}]}"#
+                .into(),
+            |b| parse::openmvg(b).is_ok(),
+        ),
+        case(
+            "cameras.sfm",
+            br#"{"version": ["1", "2", "3"], "views": [{"viewId": "1", "poseId": 1, "intrinsicId": "2", "path": "a"}], "intrinsics": [
+            {"intrinsicId": "2", "width": "9", "height": 9, "type": "radial1", "focalLength": "9", "distortionParams": ["0.1"]}], "poses":
+            [{"poseId": "1", "pose": {"transform": {"rotation": ["1", "0", "0", "0", "1", "0", "0", "0", "1"], "center": ""}}}]}"#
+                .into(),
+            |b| parse::meshroom(b).is_ok(),
+        ),
+        case(
             "bundle.txt",
             b"# Bundle file v0.3\n1 1\n500 0 0\n1 0 0\n0 1 0\n0 0 1\n1 2 3\n1 2 3\n255 0 1\n1 0 17 1.5 -2.5\n".into(),
             |b| parse::bundle(b).is_ok(),

@@ -180,6 +180,125 @@ fn opensfm() {
 }
 
 #[test]
+fn openmvg() {
+    for (lens, is_nested) in [(Lens::default(), false), (BROWN, false), (BROWN, true)] {
+        let truth = Truth::new(lens);
+        let folder = folder("images/left");
+        let f = truth.focal;
+        let ([k1, k2, k3], [p1, p2], [dx, dy]) = (truth.k, truth.p, truth.offset);
+        let size = r#""width": 64, "height": 48"#;
+        let pinhole = format!(
+            r#""focal_length": {f}, "principal_point": [{}, {}]"#,
+            32.0 + dx,
+            24.0 + dy
+        );
+        let shared = if is_nested {
+            format!(r#""value0": {{"value0": {{{size}}}, {pinhole}}}"#)
+        } else {
+            format!("{size}, {pinhole}")
+        };
+        let [mut views, mut poses] = [Vec::new(), Vec::new()];
+        // The last view has no pose.
+        for i in 0..=COUNT {
+            views.push(format!(
+                r#"{{"key": {i}, "value": {{"polymorphic_id": 1073741824, "ptr_wrapper": {{"id": 1, "data": {{"local_path": "/left",
+                "filename": "{}", "width": 64, "height": 48, "id_view": {i}, "id_intrinsic": 7, "id_pose": {i}}}}}}}}}"#,
+                name(i)
+            ));
+        }
+        for i in 0..COUNT {
+            let rows = truth.axes(i).map(|axis| axis.to_array());
+            let center = truth.center(i).to_array();
+            poses.push(format!(
+                r#"{{"key": {i}, "value": {{"rotation": {rows:?}, "center": {center:?}}}}}"#
+            ));
+        }
+        let text = format!(
+            r#"{{"sfm_data_version": "0.3", "root_path": "/absent", "views": [{}], "intrinsics": [{{"key": 7, "value": {{
+            "polymorphic_name": "pinhole_brown_t2", "ptr_wrapper": {{"data": {{{shared}, "disto_t2": [{k1}, {k2}, {k3}, {p1}, {p2}]}}}}}}}}],
+            "extrinsics": [{}], "structure": [{{"key": 3, "value": {{"X": [1, 2, 3], "observations": [{{"key": 2, "value": {{"id_feat": 0,
+            "x": [1, 2]}}}}]}}}}], "control_points": []}}"#,
+            views.join(","),
+            poses.join(",")
+        );
+        fs::write(folder.path().join("sfm_data.json"), text).unwrap();
+        let dataset = read(folder.path(), DatasetFormat::Openmvg);
+        assert!(
+            dataset.warnings[0].starts_with("1 photographs"),
+            "{:?}",
+            dataset.warnings
+        );
+        assert_eq!(dataset.views[2].points_seen, [0]);
+        assert_same(&dataset, &truth);
+        let file = folder.path().join("sfm_data.json");
+        assert_eq!(DatasetFormat::recognise(&file), Some(DatasetFormat::Openmvg));
+    }
+}
+
+#[test]
+fn meshroom() {
+    for version in [[1, 0, 0], [1, 2, 3], [1, 2, 8]] {
+        let truth = Truth::new(BROWN);
+        let folder = folder("");
+        let texts = |numbers: &[f64]| {
+            let quoted: Vec<String> = numbers.iter().map(|number| format!("\"{number}\"")).collect();
+            quoted.join(",")
+        };
+        let ([k1, k2, k3], [p1, p2], [dx, dy]) = (truth.k, truth.p, truth.offset);
+        let distortion = texts(&[k1, k2, k3, p1, p2]);
+        let intrinsics = match version {
+            [1, 0, 0] => format!(
+                r#""type": "brown", "pxFocalLength": "{}", "principalPoint": [{}]"#,
+                truth.focal,
+                texts(&[32.0 + dx, 24.0 + dy])
+            ),
+            _ => format!(
+                r#"{}, "sensorWidth": "16", "focalLength": "{}", "pixelRatio": "1", "principalPoint": [{}]"#,
+                if version == [1, 2, 3] {
+                    r#""type": "brown""#
+                } else {
+                    r#""type": "pinhole", "distortionType": "brown""#
+                },
+                truth.focal / WIDTH * 16.0,
+                texts(&[dx, dy])
+            ),
+        };
+        let [mut views, mut poses] = [Vec::new(), Vec::new()];
+        for i in 0..COUNT {
+            views.push(format!(
+                r#"{{"viewId": "{}", "poseId": "{i}", "intrinsicId": "5", "path": "C:/absent/{}", "metadata": {{"a": "b"}}}}"#,
+                i + 20,
+                name(i)
+            ));
+            let [x, y, z] = truth.axes(i);
+            let columns = [0, 1, 2].map(|c| [x[c], y[c], z[c]]).concat();
+            poses.push(format!(
+                r#"{{"poseId": "{i}", "pose": {{"transform": {{"rotation": [{}], "center": [{}]}}, "locked": "0"}}}}"#,
+                texts(&columns),
+                texts(&truth.center(i).to_array())
+            ));
+        }
+        let of_rig =
+            r#"{"viewId": "9", "poseId": "0", "rigId": "3", "subPoseId": "1", "intrinsicId": "5", "path": "rig.jpg"}"#;
+        let text = format!(
+            r#"{{"version": [{}], "views": [{}, {of_rig}], "intrinsics": [{{"intrinsicId": "5", "width": "64", "height": "48", {intrinsics},
+            "distortionParams": [{distortion}], "undistortionParams": ""}}], "poses": [{}], "structure": [{{"landmarkId": "1",
+            "descType": "sift", "color": ["255", "0", "1"], "X": ["1", "2", "3"], "observations": [{{"observationId": "22"}}]}}]}}"#,
+            texts(&version.map(f64::from)),
+            views.join(","),
+            poses.join(",")
+        );
+        fs::write(folder.path().join("cameraInit.sfm"), r#"{"views": []}"#).unwrap();
+        fs::write(folder.path().join("cameras.sfm"), text).unwrap();
+        let dataset = read(folder.path(), DatasetFormat::Meshroom);
+        assert!(dataset.warnings[0].contains("rig"), "{:?}", dataset.warnings);
+        assert_eq!(dataset.views[2].points_seen, [0]);
+        assert_eq!(dataset.points.as_ref().unwrap().colors, [[255, 0, 1]]);
+        assert_same(&dataset, &truth);
+    }
+}
+
+#[test]
 fn bundler_and_visualsfm() {
     for radial in [0.0, 0.04] {
         let lens = Lens {

@@ -11,11 +11,13 @@ mod declared;
 mod files;
 mod images;
 pub(crate) mod llff;
+pub(crate) mod meshroom;
 pub(crate) mod metashape;
 pub(crate) mod nerfies;
 mod nerfstudio;
 mod npy;
 pub(crate) mod nvm;
+pub(crate) mod openmvg;
 pub(crate) mod opensfm;
 mod panoramas;
 pub(crate) mod phone;
@@ -61,6 +63,10 @@ pub enum DatasetFormat {
     Nerfies,
     /// `reconstruction.json` of OpenSfM and OpenDroneMap.
     Opensfm,
+    /// `sfm_data.json`.
+    Openmvg,
+    /// Meshroom's `.sfm` files with poses.
+    Meshroom,
     /// Cameras exported by Metashape as XML.
     Metashape,
     /// A CSV of cameras, or an XMP beside each photograph, by RealityCapture.
@@ -80,12 +86,14 @@ impl DatasetFormat {
     ///
     /// The layout that was prepared last takes precedence: `transforms.json` is made from a COLMAP model that may be beside it. But
     /// `poses_bounds.npy` comes last, since it contains less than the COLMAP model that it is made from.
-    pub const ALL: [Self; 12] = [
+    pub const ALL: [Self; 14] = [
         Self::Blender,
         Self::Nerfstudio,
         Self::Nerfies,
         Self::Colmap,
         Self::Opensfm,
+        Self::Openmvg,
+        Self::Meshroom,
         Self::Metashape,
         Self::RealityCapture,
         Self::Polycam,
@@ -104,6 +112,8 @@ impl DatasetFormat {
             Self::Llff => "llff",
             Self::Nerfies => "nerfies",
             Self::Opensfm => "opensfm",
+            Self::Openmvg => "openmvg",
+            Self::Meshroom => "meshroom",
             Self::Metashape => "metashape",
             Self::RealityCapture => "realitycapture",
             Self::Polycam => "polycam",
@@ -121,6 +131,8 @@ impl DatasetFormat {
             Self::Llff => "poses_bounds.npy (LLFF)",
             Self::Nerfies => "dataset.json and a folder camera (Nerfies)",
             Self::Opensfm => "reconstruction.json (OpenSfM)",
+            Self::Openmvg => "sfm_data.json (OpenMVG)",
+            Self::Meshroom => "an .sfm file with poses (Meshroom)",
             Self::Metashape => "an .xml of cameras (Metashape)",
             Self::RealityCapture => "a .csv of cameras or .xmp files (RealityCapture)",
             Self::Polycam => "keyframes (Polycam)",
@@ -138,6 +150,8 @@ impl DatasetFormat {
             Self::Llff => path.join("poses_bounds.npy").is_file(),
             Self::Nerfies => nerfies::is_in(path),
             Self::Opensfm => opensfm::find(path).is_some(),
+            Self::Openmvg => openmvg::find(path).is_some(),
+            Self::Meshroom => meshroom::find(path).is_some(),
             Self::Metashape => metashape::find(path).is_some(),
             Self::RealityCapture => realitycapture::find(path).is_some(),
             Self::Polycam => phone::find_polycam(path).is_some(),
@@ -312,6 +326,8 @@ pub fn read_dataset(path: &Path, options: &DatasetOptions) -> Result<Dataset, Fo
         DatasetFormat::Llff => llff::read(path, options.downscale)?,
         DatasetFormat::Nerfies => nerfies::read(path, options.downscale)?,
         DatasetFormat::Opensfm => opensfm::read(path, options.downscale)?,
+        DatasetFormat::Openmvg => openmvg::read(path, options.downscale)?,
+        DatasetFormat::Meshroom => meshroom::read(path, options.downscale)?,
         DatasetFormat::Metashape => metashape::read(path, options.downscale)?,
         DatasetFormat::RealityCapture => realitycapture::read(path, options.downscale)?,
         DatasetFormat::Polycam => phone::read_polycam(path, options.downscale)?,

@@ -2,11 +2,13 @@
 
 use super::declared::{DeclaredDataset, DeclaredView, Split};
 use super::files::{find_image, relative_name};
+use super::openmvg;
 use super::transforms::{Frame, Transforms, parse_transforms};
 use crate::FormatError;
 use crate::error::read_and_parse;
 use crate::points_ply::read_declared_points;
 use std::collections::HashSet;
+use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
 /// JSON files of other layouts, which can be given by their path as well.
@@ -14,10 +16,8 @@ const OTHER_LAYOUT_FILES: [&str; 3] = ["reconstruction.json", "metadata.json", "
 
 /// The JSON file: `path` itself, or `transforms.json` in it.
 pub(super) fn find(path: &Path) -> Option<PathBuf> {
-    if path
-        .file_name()
-        .is_some_and(|name| OTHER_LAYOUT_FILES.iter().any(|other| name == *other))
-    {
+    let is_other = |name: &OsStr| OTHER_LAYOUT_FILES.iter().any(|other| name == *other);
+    if path.file_name().is_some_and(is_other) || openmvg::is_file_name(path) {
         return None;
     }
     let is_json = path

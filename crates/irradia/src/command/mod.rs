@@ -81,8 +81,8 @@ pub struct DataArgs {
     /// numbers in their names. Training runs on the CPU
     #[arg(long, value_name = "FRAMES[:SIDE]")]
     pub readout: Option<String>,
-    /// colmap, nerfstudio, blender, llff, nerfies, opensfm, metashape, realitycapture, polycam, record3d, nvm or bundler; detected
-    /// from the folder when absent
+    /// colmap, nerfstudio, blender, llff, nerfies, opensfm, openmvg, meshroom, metashape, realitycapture, polycam, record3d, nvm or
+    /// bundler; detected from the folder when absent
     #[arg(long)]
     pub format: Option<String>,
 }

@@ -1,0 +1,236 @@
+//! `sfm_data.json` of OpenMVG (<https://openmvg.readthedocs.io/en/latest/openMVG/sfm/sfm/>). Poses are a camera-from-world rotation, row
+//! by row, and the camera's centre. Points have no colours.
+
+use super::declared::{
+    DeclaredCamera, DeclaredDataset, DeclaredPoints, DeclaredPose, DeclaredView, Focal, lens_or_pinhole, pose_from_axes,
+};
+use super::files::{file_named, find_image, locate_image};
+use crate::error::read_and_parse;
+use crate::{FormatError, Malformed};
+use irradia_scene::Lens;
+use serde::Deserialize;
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+/// Where OpenMVG's scripts write it.
+const FILE_PATHS: [&str; 3] = [
+    "sfm_data.json",
+    "reconstruction/sfm_data.json",
+    "reconstruction_sequential/sfm_data.json",
+];
+/// Where the photographs are, relative to the file, if not where it says.
+const IMAGE_FOLDERS: [&str; 3] = ["images", "", "../images"];
+/// The colour of points, sRGB.
+const POINT_COLOR: [u8; 3] = [128; 3];
+
+/// The file.
+#[derive(Clone, Debug, Deserialize)]
+pub struct SfmData {
+    /// Folder of the photographs.
+    #[serde(default)]
+    root_path: String,
+    views: Vec<Entry<Pointer<View>>>,
+    intrinsics: Vec<Entry<Pointer<Intrinsics>>>,
+    extrinsics: Vec<Entry<Pose>>,
+    #[serde(default)]
+    structure: Vec<Entry<Landmark>>,
+}
+
+/// An entry of a map.
+#[derive(Clone, Debug, Deserialize)]
+struct Entry<T> {
+    key: u32,
+    value: T,
+}
+
+/// An object behind a pointer.
+#[derive(Clone, Debug, Deserialize)]
+struct Pointer<T> {
+    ptr_wrapper: Wrapper<T>,
+}
+
+#[derive(Clone, Debug, Deserialize)]
+struct Wrapper<T> {
+    data: T,
+}
+
+/// A photograph.
+#[derive(Clone, Debug, Deserialize)]
+struct View {
+    #[serde(default)]
+    local_path: String,
+    filename: String,
+    id_view: u32,
+    id_intrinsic: u32,
+    id_pose: u32,
+}
+
+/// A camera: its model follows from the coefficients that it has.
+#[derive(Clone, Debug, Default, Deserialize)]
+#[serde(default)]
+struct Intrinsics {
+    /// What it has in common with simpler models, in files of later versions.
+    value0: Option<Box<Intrinsics>>,
+    width: Option<f64>,
+    height: Option<f64>,
+    focal_length: Option<f64>,
+    principal_point: Option<[f64; 2]>,
+    disto_k1: Option<[f64; 1]>,
+    disto_k3: Option<[f64; 3]>,
+    /// k1, k2, k3, p1, p2.
+    disto_t2: Option<[f64; 5]>,
+    fisheye: Option<[f64; 4]>,
+}
+
+#[derive(Clone, Debug, Deserialize)]
+struct Pose {
+    rotation: [[f64; 3]; 3],
+    center: [f64; 3],
+}
+
+#[derive(Clone, Debug, Deserialize)]
+struct Landmark {
+    #[serde(rename = "X")]
+    position: [f64; 3],
+    /// By view.
+    #[serde(default)]
+    observations: Vec<Observation>,
+}
+
+#[derive(Clone, Debug, Deserialize)]
+struct Observation {
+    key: u32,
+}
+
+/// Whether a file has the name of this format.
+pub(super) fn is_file_name(path: &Path) -> bool {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    name.starts_with("sfm_data") && name.ends_with(".json")
+}
+
+pub(super) fn find(path: &Path) -> Option<PathBuf> {
+    if path.is_file() {
+        return is_file_name(path).then(|| path.to_owned());
+    }
+    FILE_PATHS.into_iter().find_map(|name| file_named(path, name))
+}
+
+pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, FormatError> {
+    let file = find(path).ok_or_else(|| FormatError::malformed(path, "contains no sfm_data.json"))?;
+    let data = read_and_parse(&file, parse_openmvg)?;
+    let root = file.parent().unwrap_or(Path::new(".")).to_owned();
+    if data.extrinsics.is_empty() {
+        let message = "has no poses; name the sfm_data.json of the reconstruction, or convert its sfm_data.bin to it";
+        return Err(FormatError::malformed(&file, message));
+    }
+    let malformed = |source| FormatError::Malformed {
+        path: file.clone(),
+        source,
+    };
+    let mut cameras = HashMap::new();
+    for Entry { key, value } in &data.intrinsics {
+        cameras.insert(*key, value.ptr_wrapper.data.camera().map_err(malformed)?);
+    }
+    let poses: HashMap<u32, &Pose> = data.extrinsics.iter().map(|entry| (entry.key, &entry.value)).collect();
+    let (points, mut points_seen) = data.points();
+    let mut views = Vec::new();
+    for view in data.views.iter().map(|entry| &entry.value.ptr_wrapper.data) {
+        let (Some(pose), Some(camera)) = (poses.get(&view.id_pose), cameras.get(&view.id_intrinsic)) else {
+            continue;
+        };
+        let name = view.name();
+        let image = find_image(&Path::new(&data.root_path).join(&name));
+        let image = image.or_else(|| locate_image(&root, &IMAGE_FOLDERS, &name));
+        views.push(DeclaredView {
+            points_seen: points_seen.remove(&view.id_view).unwrap_or_default(),
+            ..DeclaredView::posed(&root, &name, image, pose.declared(), *camera)
+        });
+    }
+    let unposed = data.views.len() - views.len();
+    let warning = (unposed > 0).then(|| format!("{unposed} photographs have no pose or no camera and are skipped"));
+    Ok(DeclaredDataset {
+        kind: "OpenMVG",
+        root,
+        views,
+        points: Some(points),
+        ignores_exif: true,
+        downscale,
+        warnings: warning.into_iter().collect(),
+    })
+}
+
+/// Parses an `sfm_data.json`.
+///
+/// # Errors
+/// When it is not JSON of that structure; with line and column.
+pub fn parse_openmvg(bytes: &[u8]) -> Result<SfmData, Malformed> {
+    serde_json::from_slice(bytes).map_err(|error| Malformed(format!("not a usable sfm_data file: {error}")))
+}
+
+impl SfmData {
+    /// The usable points, and the indices of those that each view sees.
+    fn points(&self) -> (DeclaredPoints, HashMap<u32, Vec<u32>>) {
+        let mut points = DeclaredPoints::default();
+        let mut seen: HashMap<u32, Vec<u32>> = HashMap::new();
+        for Entry { value: landmark, .. } in &self.structure {
+            let index = points.positions.len() as u32;
+            if points.push(landmark.position.into(), POINT_COLOR) {
+                for view in &landmark.observations {
+                    seen.entry(view.key).or_default().push(index);
+                }
+            }
+        }
+        (points, seen)
+    }
+}
+
+impl View {
+    /// Its path below the folder of the photographs.
+    fn name(&self) -> String {
+        let folder = self.local_path.replace('\\', "/");
+        let path = Path::new(folder.trim_matches('/')).join(self.filename.replace('\\', "/"));
+        path.to_string_lossy().into_owned()
+    }
+}
+
+impl Intrinsics {
+    /// A value of its own, or of what it has in common with simpler models.
+    fn get<T>(&self, value: fn(&Self) -> Option<T>) -> Option<T> {
+        value(self).or_else(|| self.value0.as_deref()?.get(value))
+    }
+
+    fn camera(&self) -> Result<DeclaredCamera, Malformed> {
+        let size = self.get(|own| own.width).zip(self.get(|own| own.height));
+        let Some((width, height)) = size.filter(|(width, height)| *width >= 1.0 && *height >= 1.0) else {
+            return Err(Malformed("a camera has no width and height".into()));
+        };
+        // Panoramas have nothing else.
+        let Some(focal) = self.get(|own| own.focal_length) else {
+            return Ok(DeclaredCamera::panorama());
+        };
+        let opencv = |[k1, k2, k3]: [f64; 3], p: [f64; 2]| Lens::Opencv {
+            k: [k1, k2, k3, 0.0, 0.0, 0.0],
+            p,
+        };
+        let lens = match (self.disto_k1, self.disto_k3, self.disto_t2, self.fisheye) {
+            (Some([k1]), ..) => opencv([k1, 0.0, 0.0], [0.0; 2]),
+            (_, Some(k), ..) => opencv(k, [0.0; 2]),
+            (_, _, Some([k1, k2, k3, p1, p2]), _) => opencv([k1, k2, k3], [p1, p2]),
+            (_, _, _, Some(k)) => Lens::fisheye(k),
+            _ => Lens::Pinhole,
+        };
+        Ok(DeclaredCamera {
+            size: Some([width, height]),
+            focal: Focal::Pixels([focal; 2]),
+            center: self.get(|own| own.principal_point),
+            lens: lens_or_pinhole(lens),
+        })
+    }
+}
+
+impl Pose {
+    fn declared(&self) -> Option<DeclaredPose> {
+        let [right, down, forward] = self.rotation.map(Into::into);
+        pose_from_axes(right, down, forward, self.center.into())
+    }
+}

@@ -24,6 +24,7 @@ mod ply;
 mod points_ply;
 mod splats;
 mod tensors;
+mod text;
 mod undistort;
 mod unpack;
 mod valid_region;

@@ -1,10 +1,12 @@
-//! The subset of XML that camera exports and metadata (XMP) use: elements, attributes, text. No document types, and no entities
-//! beyond XML's five predefined ones.
+//! The subset of XML that camera exports and metadata (XMP) use: elements, attributes, text, and references to characters by their numbers
+//! or XML's five predefined names. No document types.
 
 use crate::Malformed;
 
 /// Maximum nesting depth of elements; a deeper file cannot be a list of cameras.
 const MAX_DEPTH: usize = 64;
+/// Maximum length of a reference to a character, bytes.
+const MAX_REFERENCE_BYTES: usize = 12;
 
 /// An element with its contents.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -70,7 +72,8 @@ pub(crate) fn numbers(text: &str) -> Vec<f64> {
 /// # Errors
 /// When tags do not match, or there is no element.
 pub fn parse_xml(bytes: &[u8]) -> Result<Element, Malformed> {
-    let mut rest = crate::dataset::tokens::text(bytes)?;
+    let text = crate::text::text(bytes);
+    let mut rest = &*text;
     // The open elements, the innermost last; the first one is a placeholder that holds the root.
     let mut open = vec![Element::default()];
     while let Some(at) = rest.find('<') {
@@ -175,20 +178,39 @@ fn start_tag(tag: &str) -> Result<Element, Malformed> {
     })
 }
 
+/// `text` with the characters to which it refers, such as `&amp;` and `&#252;`.
 fn unescaped(text: &str) -> String {
-    let mut text = text.to_owned();
-    for (escape, character) in [
-        ("&lt;", "<"),
-        ("&gt;", ">"),
-        ("&quot;", "\""),
-        ("&apos;", "'"),
-        ("&amp;", "&"),
-    ] {
-        if text.contains('&') {
-            text = text.replace(escape, character);
+    let mut unescaped = String::with_capacity(text.len());
+    let mut rest = text;
+    while let Some(at) = rest.find('&') {
+        unescaped.push_str(&rest[..at]);
+        rest = &rest[at + 1..];
+        let end = rest.bytes().take(MAX_REFERENCE_BYTES).position(|byte| byte == b';');
+        match end.and_then(|end| Some((referred(&rest[..end])?, end + 1))) {
+            Some((character, length)) => {
+                unescaped.push(character);
+                rest = &rest[length..];
+            }
+            None => unescaped.push('&'),
         }
     }
-    text
+    unescaped + rest
+}
+
+/// The character of a reference, without its `&` and `;`.
+fn referred(name: &str) -> Option<char> {
+    match name {
+        "lt" => Some('<'),
+        "gt" => Some('>'),
+        "quot" => Some('"'),
+        "apos" => Some('\''),
+        "amp" => Some('&'),
+        _ => {
+            let digits = name.strip_prefix('#')?;
+            let hexadecimal = digits.strip_prefix('x').map(|digits| u32::from_str_radix(digits, 16));
+            char::from_u32(hexadecimal.unwrap_or_else(|| digits.parse()).ok()?)
+        }
+    }
 }
 
 #[cfg(test)]
@@ -204,6 +226,20 @@ mod tests {
         assert_eq!(root.child("b").map(|b| b.text.as_str()), Some("3<4>"));
         assert_eq!(root.numbers(), [1.0, 2.0, 5.0]);
         assert_eq!(root.descendants("b").len(), 1);
+    }
+
+    #[test]
+    fn references_to_characters_are_resolved_once() {
+        for (text, expected) in [
+            ("T&#252;r &#xDF;&lt;&gt;&quot;&apos;", "Tür ß<>\"'"),
+            ("&amp;lt; &amp;#252;", "&lt; &#252;"),
+            (
+                "& &; &#; &#x; &#xD800; &#99999999; &other; &amp",
+                "& &; &#; &#x; &#xD800; &#99999999; &other; &amp",
+            ),
+        ] {
+            assert_eq!(unescaped(text), expected);
+        }
     }
 
     #[test]

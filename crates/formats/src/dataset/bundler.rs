@@ -3,9 +3,10 @@
 
 use super::declared::{DeclaredCamera, DeclaredDataset, DeclaredPose, DeclaredView, Focal, lens_or_pinhole};
 use super::files::{first_file, locate_image};
-use super::tokens::{Tokens, text};
+use super::tokens::Tokens;
 use super::tracks::{TrackPoint, declared_points, parse_track_point};
 use crate::error::read_and_parse;
+use crate::text::text;
 use crate::{FormatError, Malformed};
 use glam::{DMat3, DVec3};
 use irradia_scene::Lens;
@@ -76,10 +77,8 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
         return Err(FormatError::malformed(&file, message));
     };
     let names = read_and_parse(&list, |bytes| {
-        let names = text(bytes)?
-            .lines()
-            .map(name_in_list_line)
-            .filter(|name| !name.is_empty());
+        let text = text(bytes);
+        let names = text.lines().map(name_in_list_line).filter(|name| !name.is_empty());
         Ok(names.map(str::to_owned).collect::<Vec<String>>())
     })?;
     if names.len() != bundle.cameras.len() {
@@ -116,7 +115,7 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
 /// # Errors
 /// When it is of another version, truncated, or has a word where a number is expected.
 pub fn parse_bundle(bytes: &[u8]) -> Result<Bundle, Malformed> {
-    let text = text(bytes)?;
+    let text = text(bytes);
     let body = text
         .strip_prefix("# Bundle file v0.3")
         .ok_or_else(|| Malformed("not a bundle of version 0.3".into()))?;

@@ -25,7 +25,7 @@ mod readout;
 pub(crate) mod realitycapture;
 mod sibling_folder;
 mod split;
-pub(crate) mod tokens;
+mod tokens;
 mod tracks;
 pub(crate) mod transforms;
 mod visible;

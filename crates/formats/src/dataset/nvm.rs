@@ -3,9 +3,10 @@
 
 use super::declared::{DeclaredCamera, DeclaredDataset, DeclaredPose, DeclaredView, Focal, lens_or_pinhole};
 use super::files::{first_file, locate_image};
-use super::tokens::{Tokens, text};
+use super::tokens::Tokens;
 use super::tracks::{TrackPoint, declared_points, parse_track_point};
 use crate::error::read_and_parse;
+use crate::text::text;
 use crate::{FormatError, Malformed};
 use glam::DQuat;
 use irradia_scene::Lens;
@@ -87,7 +88,7 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
 /// # Errors
 /// When it is of another version, truncated, or has a word where a number is expected.
 pub fn parse_nvm(bytes: &[u8]) -> Result<Vec<NvmModel>, Malformed> {
-    let text = text(bytes)?;
+    let text = text(bytes);
     let mut lines = text
         .lines()
         .filter(|line| !line.trim().is_empty() && !line.starts_with('#'));

@@ -9,9 +9,9 @@ use super::declared::{
     DeclaredCamera, DeclaredDataset, DeclaredPose, DeclaredView, Focal, lens_or_pinhole, pose_from_axes,
 };
 use super::files::{first_file, is_image_name, list_files, locate_image, relative_name, start_matches};
-use super::tokens::text;
 use crate::error::read_and_parse;
 use crate::image_file::read_header;
+use crate::text::text;
 use crate::xml::{numbers, parse_xml, property};
 use crate::{FormatError, Malformed};
 use glam::{DMat3, DVec3};
@@ -138,7 +138,8 @@ fn view(root: &Path, image: Option<PathBuf>, row: RealityCaptureView) -> Declare
 /// # Errors
 /// When a column is missing, or a value is not a number.
 pub fn parse_realitycapture_csv(bytes: &[u8]) -> Result<Vec<RealityCaptureView>, Malformed> {
-    let mut lines = text(bytes)?.lines();
+    let text = text(bytes);
+    let mut lines = text.lines();
     let header: HashMap<&str, usize> = lines
         .next()
         .unwrap_or_default()

@@ -2,6 +2,8 @@
 
 use super::declared::Split;
 use crate::FormatError;
+use crate::error::read_file;
+use crate::text::text;
 use irradia_scene::every_eighth;
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
@@ -37,9 +39,7 @@ struct NameList {
 
 impl NameList {
     fn parse(file: String, text: &str) -> Self {
-        // Some editors begin a text with a byte order mark.
         let lines = text
-            .trim_start_matches('\u{feff}')
             .lines()
             .map(str::trim)
             .filter(|line| !line.is_empty() && !line.starts_with('#'));
@@ -106,11 +106,7 @@ pub(super) fn split(
         Holdout::Every(n) => split_by(&|i| i.is_multiple_of(*n)),
         Holdout::Nothing => split_by(&|_| false),
         Holdout::Listed(file) => {
-            let text = std::fs::read_to_string(file).map_err(|source| FormatError::Read {
-                path: file.clone(),
-                source,
-            })?;
-            let list = NameList::parse(file.display().to_string(), &text);
+            let list = NameList::parse(file.display().to_string(), &text(&read_file(file)?));
             let listed = split_by(&|i| list.contains(&names[i]));
             if listed.test.is_empty() {
                 return Err(FormatError::Option(format!(
@@ -208,8 +204,8 @@ fn read_list(root: &Path, files: [&str; 2]) -> Option<NameList> {
         .iter()
         .flat_map(|folder| files.iter().map(move |file| Path::new(folder).join(file)));
     for candidate in candidates {
-        if let Ok(text) = std::fs::read_to_string(root.join(&candidate)) {
-            return Some(NameList::parse(candidate.display().to_string(), &text));
+        if let Ok(bytes) = std::fs::read(root.join(&candidate)) {
+            return Some(NameList::parse(candidate.display().to_string(), &text(&bytes)));
         }
     }
     None
@@ -244,8 +240,9 @@ mod tests {
     fn a_file_name_matches_in_any_folder_and_names_without_a_view_are_reported() {
         let root = tempfile::tempdir().unwrap();
         let file = root.path().join("list.txt");
-        std::fs::write(&file, "\u{feff}1.jpg\nx.jpg\ny\n").unwrap();
-        let names = ["images/cam0/1.jpg", "images/cam1/1.jpg", "images/cam1/2.jpg"].map(String::from);
+        // In Windows-1252.
+        std::fs::write(&file, b"1\xfc.jpg\nx.jpg\ny\n").unwrap();
+        let names = ["images/cam0/1ü.jpg", "images/cam1/1ü.jpg", "images/cam1/2.jpg"].map(String::from);
         let indices = split(&Holdout::Listed(file), root.path(), &names, vec![None; 3]).unwrap();
         assert_eq!((indices.train, indices.test), (vec![2], vec![0, 1]));
         let warning = indices.warning.unwrap();

@@ -44,9 +44,3 @@ impl<'a> Tokens<'a> {
         Ok(())
     }
 }
-
-/// The text of a file in UTF-8, without a byte order mark.
-pub(crate) fn text(bytes: &[u8]) -> Result<&str, Malformed> {
-    let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
-    std::str::from_utf8(bytes).map_err(|_| Malformed("is not text in UTF-8".into()))
-}

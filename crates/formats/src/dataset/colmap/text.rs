@@ -9,7 +9,7 @@ use std::str::{FromStr, SplitAsciiWhitespace};
 /// # Errors
 /// When a line is invalid; it is named by number.
 pub fn parse_cameras(bytes: &[u8]) -> Result<Vec<ColmapCamera>, Malformed> {
-    let text = utf8(bytes)?;
+    let text = checked_text(bytes)?;
     content_lines(&text)
         .map(|(number, line)| {
             let mut words = Words::new(number, line);
@@ -30,7 +30,7 @@ pub fn parse_cameras(bytes: &[u8]) -> Result<Vec<ColmapCamera>, Malformed> {
 /// # Errors
 /// When a line is invalid; it is named by number.
 pub fn parse_images(bytes: &[u8]) -> Result<Vec<ColmapImage>, Malformed> {
-    let text = utf8(bytes)?;
+    let text = checked_text(bytes)?;
     let mut lines = text.lines().enumerate().peekable();
     let mut images = Vec::new();
     while let Some((index, line)) = lines.next() {
@@ -67,7 +67,7 @@ pub fn parse_images(bytes: &[u8]) -> Result<Vec<ColmapImage>, Malformed> {
 /// # Errors
 /// When a line is invalid; it is named by number.
 pub fn parse_points(bytes: &[u8]) -> Result<Vec<ColmapPoint>, Malformed> {
-    let text = utf8(bytes)?;
+    let text = checked_text(bytes)?;
     content_lines(&text)
         .map(|(number, line)| {
             let mut words = Words::new(number, line);
@@ -103,13 +103,13 @@ fn content_lines(text: &str) -> impl Iterator<Item = (usize, &str)> {
     numbered.filter(|(_, line)| !line.is_empty() && !line.starts_with('#'))
 }
 
-fn utf8(bytes: &[u8]) -> Result<std::borrow::Cow<'_, str>, Malformed> {
+fn checked_text(bytes: &[u8]) -> Result<std::borrow::Cow<'_, str>, Malformed> {
     if bytes.contains(&0) {
         return Err(Malformed(
             "contains zero bytes, so it is not text; is it a binary model under a .txt name?".into(),
         ));
     }
-    Ok(String::from_utf8_lossy(bytes))
+    Ok(crate::text::text(bytes))
 }
 
 /// The words of one line, with its number for errors.

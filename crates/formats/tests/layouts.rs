@@ -401,16 +401,16 @@ fn metashape() {
             <resolution width="64" height="48"/><calibration type="frame" class="initial"><f>1</f></calibration>
             <calibration type="frame" class="adjusted"><resolution width="64" height="48"/><f>{f}</f><cx>{dx}</cx><cy>{dy}</cy>
             <k1>{k1}</k1><k2>{k2}</k2><k3>{k3}</k3><p1>{p2}</p1><p2>{p1}</p2></calibration></sensor></sensors>
-            <cameras><group>{cameras}</group><camera id="9" sensor_id="0" label="not aligned"/></cameras>
+            <cameras><group>{cameras}</group><camera id="9" sensor_id="0" label="not aligned"/>
+            <camera id="10" sensor_id="0" label="disabled" enabled="false"><transform>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform></camera>
+            </cameras>
             <transform><rotation>{t}</rotation><translation>3 -1 2</translation><scale>0.5</scale></transform></chunk></document>"#
         );
         fs::write(folder.path().join("cameras.xml"), text).unwrap();
         let dataset = read(folder.path(), DatasetFormat::Metashape);
-        assert!(
-            dataset.warnings[0].starts_with("1 photographs are not aligned"),
-            "{:?}",
-            dataset.warnings
-        );
+        let [disabled, unaligned] = [&dataset.warnings[0], &dataset.warnings[1]];
+        assert!(disabled.starts_with("1 photographs are disabled"), "{disabled}");
+        assert!(unaligned.starts_with("1 photographs are not aligned"), "{unaligned}");
         assert_same(&dataset, &truth);
     }
 }

@@ -27,8 +27,12 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
     let file = find(path).ok_or_else(|| FormatError::malformed(path, "contains no Metashape cameras"))?;
     let cameras = read_and_parse(&file, parse_metashape)?;
     let root = file.parent().unwrap_or(Path::new(".")).to_owned();
-    let (posed, unposed): (Vec<_>, Vec<_>) = cameras.into_iter().partition(|camera| camera.pose.is_some());
+    let (enabled, disabled): (Vec<_>, Vec<_>) = cameras.into_iter().partition(|camera| camera.is_enabled);
+    let (posed, unposed): (Vec<_>, Vec<_>) = enabled.into_iter().partition(|camera| camera.pose.is_some());
     let mut warnings = Vec::new();
+    if !disabled.is_empty() {
+        warnings.push(format!("{} photographs are disabled and are skipped", disabled.len()));
+    }
     if !unposed.is_empty() {
         warnings.push(format!("{} photographs are not aligned and are skipped", unposed.len()));
     }
@@ -57,6 +61,8 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
 /// A photograph of a chunk.
 pub(crate) struct MetashapeCamera {
     label: String,
+    /// Whether its user has left it enabled.
+    is_enabled: bool,
     /// `None` if it is not aligned.
     pose: Option<DeclaredPose>,
     intrinsics: DeclaredCamera,
@@ -97,12 +103,14 @@ pub(crate) fn parse_metashape(bytes: &[u8]) -> Result<Vec<MetashapeCamera>, Malf
         let label = camera
             .attribute("label")
             .ok_or_else(|| Malformed("a <camera> has no label".into()))?;
+        let is_enabled = !matches!(camera.attribute("enabled"), Some("false" | "0"));
         let matrix = camera.child("transform").map(Element::numbers);
         let sensor = camera.attribute("sensor_id").and_then(|id| sensors.get(id));
         let (Some(matrix), Some((intrinsics, is_skewed))) = (matrix, sensor) else {
             if let Some((intrinsics, is_skewed)) = sensors.values().next() {
                 found.push(MetashapeCamera {
                     label: label.to_owned(),
+                    is_enabled,
                     pose: None,
                     intrinsics: *intrinsics,
                     is_skewed: *is_skewed,
@@ -119,6 +127,7 @@ pub(crate) fn parse_metashape(bytes: &[u8]) -> Result<Vec<MetashapeCamera>, Malf
         let component = camera.attribute("component_id").and_then(|id| components.get(id));
         found.push(MetashapeCamera {
             label: label.to_owned(),
+            is_enabled,
             pose: pose(&matrix, component.or(world_from_chunk.as_ref())),
             intrinsics: *intrinsics,
             is_skewed: *is_skewed,

@@ -112,17 +112,16 @@ fn collect(
     by_stem: &mut HashMap<String, PathBuf>,
 ) {
     // An unreadable folder is treated as empty; the warning about missing masks reports it.
-    for path in std::fs::read_dir(folder)
-        .into_iter()
-        .flatten()
-        .flatten()
-        .map(|entry| entry.path())
-    {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let mut paths: Vec<PathBuf> = entries.map(|entry| entry.path()).collect();
+    // Of files that differ in their extensions only, the first is taken, on every file system: `.npy` before `.png`.
+    paths.sort();
+    for path in paths {
         if path.is_dir() && depth > 0 {
             collect(top, &path, depth - 1, keep, by_stem);
         } else if keep(&path) {
             let name = relative_name(top, &path).to_lowercase();
-            by_stem.insert(without_extension(&name).to_owned(), path);
+            by_stem.entry(without_extension(&name).to_owned()).or_insert(path);
         }
     }
 }
@@ -142,7 +141,7 @@ mod tests {
     fn depths_are_found_by_name_and_may_be_arrays() {
         let root = tempfile::tempdir().unwrap();
         std::fs::create_dir_all(root.path().join("depths")).unwrap();
-        for name in ["a.png", "b.npy", "c.txt"] {
+        for name in ["a.png", "b.png", "b.npy", "b.tif", "c.txt"] {
             std::fs::write(root.path().join("depths").join(name), b"").unwrap();
         }
         let depths = SiblingFolder::depths(root.path()).unwrap();

@@ -11,6 +11,7 @@ use crate::undistort::Undistortion;
 use glam::{DQuat, DVec2, DVec3};
 use image::metadata::Orientation;
 use irradia_scene::{Intrinsics, Lens, resize_area};
+use std::collections::BTreeMap;
 use std::f64::consts::{FRAC_PI_2, PI};
 use std::path::Path;
 
@@ -177,18 +178,18 @@ fn circle_angle(source: &Intrinsics, width: u32, height: u32, brightest: &[u8]) 
     }
     // Rings one pixel wide; from the outermost inwards, the first that is mostly not black.
     let ring_width = 1.0 / f64::from(k.fx.min(k.fy));
-    let mut rings: Vec<[u32; 2]> = Vec::new();
+    let mut rings: BTreeMap<usize, [u32; 2]> = BTreeMap::new();
     for (at, value) in (0u32..).zip(brightest) {
         let (x, y) = (f64::from(at % width) + 0.5, f64::from(at / width) + 0.5);
         let index = (k.plane_of(DVec2::new(x, y)).length() / ring_width) as usize;
-        rings.resize(rings.len().max(index + 1), [0; 2]);
-        rings[index][0] += 1;
-        rings[index][1] += u32::from(*value > MAX_BLACK);
+        let [all, lit] = rings.entry(index).or_default();
+        *all += 1;
+        *lit += u32::from(*value > MAX_BLACK);
     }
-    let rim = rings.iter().rposition(|[all, lit]| *all > 0 && 2 * lit > *all)?;
+    let (rim, _) = rings.iter().rfind(|(_, [all, lit])| 2 * lit > *all)?;
     let direction = k
         .lens
-        .direction(DVec2::new(USED_RADIUS_FRACTION * (rim as f64 + 0.5) * ring_width, 0.0))?;
+        .direction(DVec2::new(USED_RADIUS_FRACTION * (*rim as f64 + 0.5) * ring_width, 0.0))?;
     Some(angle(direction))
 }
 
@@ -341,6 +342,13 @@ mod tests {
                 "{name} {width}x{height}"
             );
         }
+    }
+
+    #[test]
+    fn a_principal_point_far_away_leaves_no_circle_and_takes_no_memory() {
+        let mut k = camera(Lens::fisheye([0.0; 4]), 64, 48, [20.0; 2]);
+        k.cx = 1e20;
+        assert_eq!(circle_angle(&k, 64, 48, &[0; 64 * 48]), None);
     }
 
     #[test]

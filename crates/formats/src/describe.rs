@@ -1,6 +1,5 @@
 //! Descriptions of files and folders.
 
-use crate::error::read_and_parse;
 use crate::splats::ply::has_splats;
 use crate::{
     DatasetFormat, DatasetOptions, FormatError, SplatFile, SplatFormat, read_dataset, read_points_ply, read_splat_file,
@@ -37,7 +36,7 @@ pub fn detect(path: &Path) -> Result<Kind, FormatError> {
         read_dataset(path, &DatasetOptions::default())?;
     }
     match SplatFormat::of_existing(path)? {
-        SplatFormat::Ply | SplatFormat::PointsPly if !read_and_parse(path, has_splats)? => Ok(Kind::Points),
+        SplatFormat::Ply | SplatFormat::PointsPly if !has_splats(path)? => Ok(Kind::Points),
         format => Ok(Kind::Splats(format)),
     }
 }

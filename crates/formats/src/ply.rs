@@ -5,7 +5,7 @@ use irradia_scene::Scalar;
 use std::borrow::Cow;
 
 /// A header is a few kilobytes; a file without `end_header` is not searched to its end.
-const MAX_HEADER_BYTES: usize = 1 << 20;
+pub(crate) const MAX_HEADER_BYTES: usize = 1 << 20;
 
 /// The type that has this name in a header.
 fn scalar_of(name: &str) -> Option<Scalar> {

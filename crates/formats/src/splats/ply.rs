@@ -6,14 +6,16 @@
 //! neighbouring floats are centimetres apart; a comment then holds [`GaussianCloud::world_from_dataset`], with which reading returns to
 //! floats.
 
-use crate::Malformed;
-use crate::ply::{Column, Ply, Rows, name_of};
+use crate::ply::{Column, MAX_HEADER_BYTES, Ply, Rows, name_of};
 use crate::splats::compressed_ply;
 use crate::splats::rows::{SPLATS_PER_TASK, decode_splats};
+use crate::{FormatError, Malformed};
 use glam::DVec3;
 use irradia_scene::{ExtraColumn, GaussianCloud, Similarity, sh};
 use rayon::prelude::*;
-use std::io::{self, Write};
+use std::fs::File;
+use std::io::{self, Read, Write};
+use std::path::Path;
 
 /// The comment that stores [`GaussianCloud::antialiased`], for which the layout has no property.
 const ANTIALIASED_COMMENT: &str = "antialiased 1";
@@ -142,12 +144,20 @@ pub(crate) fn is_compressed(bytes: &[u8]) -> bool {
     Ply::parse(bytes).is_ok_and(|ply| ply.has(compressed_ply::CHUNK_ELEMENT))
 }
 
-/// Whether a PLY contains splats rather than a point cloud, by the names of its properties.
-pub(crate) fn has_splats(bytes: &[u8]) -> Result<bool, Malformed> {
-    let ply = Ply::parse(bytes)?;
-    Ok(ply
-        .property_names("vertex")?
-        .any(|name| name.starts_with("f_dc_") || name.starts_with("packed_")))
+/// Whether a PLY contains splats rather than a point cloud, by the names of its properties; reads its header only.
+pub(crate) fn has_splats(path: &Path) -> Result<bool, FormatError> {
+    let mut header = Vec::new();
+    let read = File::open(path).and_then(|file| file.take(MAX_HEADER_BYTES as u64).read_to_end(&mut header));
+    read.map_err(|source| FormatError::Read {
+        path: path.to_owned(),
+        source,
+    })?;
+    let is_of_splats = |name: &str| name.starts_with("f_dc_") || name.starts_with("packed_");
+    let found = Ply::parse(&header).and_then(|ply| Ok(ply.property_names("vertex")?.any(is_of_splats)));
+    found.map_err(|source| FormatError::Malformed {
+        path: path.to_owned(),
+        source,
+    })
 }
 
 struct Columns {

@@ -401,9 +401,16 @@ impl Edit {
 fn from_tagged<T: DeserializeOwned>(table: impl Into<toml::Value>, tag: &str) -> Result<T, EditError> {
     let table = table.into();
     let name = table.get(tag).and_then(toml::Value::as_str).unwrap_or(tag).to_owned();
-    table
-        .try_into()
-        .map_err(|error: toml::de::Error| EditError::Syntax(format!("{name}: {}", error.message().replace('\n', " "))))
+    table.try_into().map_err(|error: toml::de::Error| {
+        let message = error.message().replace('\n', " ");
+        let message = ["usize", "u32"].iter().fold(message, |message, whole| {
+            message.replace(&format!("expected {whole}"), "expected a whole number")
+        });
+        EditError::Syntax(format!(
+            "{name}: {}",
+            message.replace("expected f64", "expected a number")
+        ))
+    })
 }
 
 fn check_within(name: &str, value: f64, low: f64, high: f64) -> Result<(), EditError> {

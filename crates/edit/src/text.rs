@@ -6,8 +6,8 @@
 //!
 //! `+` adds a shape to the selection (the default without a sign), `-` subtracts it, `&` intersects. Values are numbers, words, vectors
 //! (`1,2,3`) and lists of vectors (`0,0;1,0;1,1`, a single one as `0,0;`); `camera.size=640,480` is a key of a table. Text in quotes,
-//! such as `"my scene.ply"`, is one word and never a number. Keys are the same as in TOML, so that a new operation or shape needs no
-//! change here.
+//! such as `"my scene.ply"`, is one word and never a number, and so is a name. Keys are the same as in TOML, so that a new operation or
+//! shape needs no change here unless it has a name.
 
 use crate::{Edit, EditError};
 use std::fmt;
@@ -16,6 +16,8 @@ use toml::{Table, Value};
 
 /// Keeps spaces within a word.
 const QUOTE: char = '"';
+/// Keys of names, which may look like numbers.
+const NAME_KEYS: [&str; 2] = ["file", "name"];
 
 impl FromStr for Edit {
     type Err = EditError;
@@ -37,7 +39,12 @@ impl FromStr for Edit {
             match word.split_once('=') {
                 Some((key, text)) => {
                     let table = steps.last_mut().unwrap_or(&mut edit);
-                    insert(table, key, parse_value(text)).map_err(|why| EditError::Syntax(format!("{word}: {why}")))?;
+                    let value = if NAME_KEYS.contains(&key) {
+                        unquoted(text)
+                    } else {
+                        parse_value(text)
+                    };
+                    insert(table, key, value).map_err(|why| EditError::Syntax(format!("{word}: {why}")))?;
                 }
                 None => {
                     let (mode, shape) = match word.split_at_checked(1) {
@@ -104,12 +111,8 @@ fn insert(table: &mut Table, key: &str, value: Value) -> Result<(), &'static str
 /// Parses a number, a vector, a list of vectors or a Boolean; anything else, and anything in quotes, is a word.
 fn parse_value(text: &str) -> Value {
     if text.contains(QUOTE) {
-        return text.replace(QUOTE, "").into();
+        return unquoted(text);
     }
-    let number = |text: &str| {
-        let whole = text.parse().map(Value::Integer);
-        whole.or_else(|_| text.parse().map(Value::Float)).ok()
-    };
     let vector = |text: &str| -> Option<Value> {
         let numbers: Option<Vec<Value>> = text.split(',').map(number).collect();
         Some(Value::Array(numbers?))
@@ -123,6 +126,24 @@ fn parse_value(text: &str) -> Value {
         text.parse().map(Value::Boolean).ok().or_else(|| number(text))
     };
     found.unwrap_or_else(|| text.into())
+}
+
+/// An integer, also in the form `1e6`, or another number.
+fn number(text: &str) -> Option<Value> {
+    if let Ok(whole) = text.parse() {
+        return Some(Value::Integer(whole));
+    }
+    let number: f64 = text.parse().ok()?;
+    let is_whole = text.contains(['e', 'E']) && number.fract() == 0.0 && number.abs() < 1e15;
+    Some(if is_whole {
+        Value::Integer(number as i64)
+    } else {
+        Value::Float(number)
+    })
+}
+
+fn unquoted(text: &str) -> Value {
+    text.replace(QUOTE, "").into()
 }
 
 impl fmt::Display for Edit {

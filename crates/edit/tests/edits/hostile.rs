@@ -125,7 +125,10 @@ fn words_are_checked_too() {
             &format!("delete all {}x=1", "a.".repeat(100_000)),
             "all: unknown field `a`",
         ),
-        ("delete sphere center=0,0,0 radius=one", "edit"),
+        ("delete sphere center=0,0,0 radius=one", "expected a number"),
+        ("reduce count=some", "expected a whole number"),
+        ("reduce count=1.5", "expected a whole number"),
+        ("reduce count=-1", "expected a whole number"),
         ("delete sphere center=0,0,0 radius=1 radius=2", "given twice"),
         ("delete sphere center=0,0 radius=1", "invalid length"),
         ("move by=0,0,nan", "move by"),
@@ -136,7 +139,23 @@ fn words_are_checked_too() {
         let error: EditError = line.parse::<Edit>().expect_err(line);
         let message = error.to_string();
         assert!(!message.contains('\n'), "{message}");
-        assert!(words == "edit" || message.contains(words), "{line}: {message}");
+        assert!(message.contains(words), "{line}: {message}");
+    }
+}
+
+#[test]
+fn names_may_look_like_numbers_and_numbers_may_have_exponents() {
+    for (line, same) in [
+        ("split name=05 all", "split name=\"05\" all"),
+        ("merge file=1e6", "merge file=\"1e6\""),
+        ("reduce count=1e6", "reduce count=1000000"),
+        (
+            "delete sphere center=1e0,-2E1,1e-1 radius=2e0",
+            "delete sphere center=1,-20,0.1 radius=2",
+        ),
+    ] {
+        assert_eq!(line.parse::<Edit>(), same.parse(), "{line}");
+        assert!(line.parse::<Edit>().is_ok(), "{line}");
     }
 }
 

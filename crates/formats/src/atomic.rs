@@ -12,18 +12,56 @@ use tempfile::NamedTempFile;
 /// # Errors
 /// [`FormatError::Write`] with the system's reason, such as a full disk; the temporary file is removed.
 pub fn write_atomic(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(), FormatError> {
-    write_via_temporary(path, write).map_err(|source| FormatError::Write {
-        path: path.to_owned(),
-        source,
-    })
+    StagedFile::write(path, write)?.put_in_place()
 }
 
-fn write_via_temporary(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> io::Result<()> {
-    let path = &resolve_links(path);
+/// A file that is complete under a temporary name. If several files belong together, all of them are staged before the first is put in
+/// place. Otherwise [`write_atomic`] does both.
+#[derive(Debug)]
+pub struct StagedFile {
+    path: PathBuf,
+    /// `None` if the file was written to directly.
+    temporary: Option<NamedTempFile>,
+}
+
+impl StagedFile {
+    /// Writes the file under a temporary name, which is removed unless it is put in place.
+    ///
+    /// # Errors
+    /// Those of [`write_atomic`].
+    pub fn write(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<Self, FormatError> {
+        let path = resolve_links(path);
+        match write_temporary(&path, write) {
+            Ok(temporary) => Ok(Self { path, temporary }),
+            Err(source) => Err(FormatError::Write { path, source }),
+        }
+    }
+
+    /// Renames the file to its final name.
+    ///
+    /// # Errors
+    /// [`FormatError::Write`] with the system's reason.
+    pub fn put_in_place(self) -> Result<(), FormatError> {
+        let Self { path, temporary } = self;
+        match temporary.map(|temporary| temporary.persist(&path)) {
+            Some(Err(error)) => Err(FormatError::Write {
+                path,
+                source: error.error,
+            }),
+            _ => Ok(()),
+        }
+    }
+}
+
+fn write_temporary(
+    path: &Path,
+    write: impl FnOnce(&mut dyn Write) -> io::Result<()>,
+) -> io::Result<Option<NamedTempFile>> {
     if fs::metadata(path).is_ok_and(|metadata| !metadata.is_file() && !metadata.is_dir()) {
         let mut writer = BufWriter::with_capacity(1 << 18, OpenOptions::new().write(true).open(path)?);
         write(&mut writer)?;
-        return writer.flush();
+        writer.flush()?;
+        return Ok(None);
     }
     if let Some(folder) = folder_of(path) {
         fs::create_dir_all(folder)?;
@@ -32,8 +70,7 @@ fn write_via_temporary(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Re
     write(&mut writer)?;
     let temporary = writer.into_inner().map_err(|error| error.into_error())?;
     temporary.as_file().sync_all()?;
-    temporary.persist(path)?;
-    Ok(())
+    Ok(Some(temporary))
 }
 
 /// Where links from `path` lead, also if there is no file yet, which has no canonical path. Links may lead in a circle: as many are followed

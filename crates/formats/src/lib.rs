@@ -31,7 +31,7 @@ mod valid_region;
 mod xml;
 mod zip;
 
-pub use atomic::write_atomic;
+pub use atomic::{StagedFile, write_atomic};
 pub use dataset::colmap::{
     ColmapCamera, ColmapImage, ColmapModel, ColmapPoint, PosedImage, TrackedPoint, read_colmap_poses, write_colmap,
 };

@@ -2,14 +2,14 @@
 
 use crate::cameras::{CAMERAS, cameras_beside, moved_cameras_json, write_own_cameras};
 use crate::folder::{SKY, VIGNETTE};
-use crate::levels::write_scene;
+use crate::levels::{remove_levels, write_scene};
 use crate::lock::FolderLock;
 use crate::photographs::photographs_of;
 use crate::scene_file::{check_not_overwritten, is_field, same_file};
 use crate::{RunError, RunFolder, SCENE, Scene, residual_left_out, scene_path, write_image};
 use irradia_edit::{Applied, Draft, Edit, EditList, Provenance, Transform, apply};
 use irradia_formats::{
-    SplatFile, SplatFormat, WriteOptions, read_splat_file, write_atomic, write_splats, write_splats_with,
+    SplatFile, SplatFormat, StagedFile, WriteOptions, encode_splats, read_splat_file, write_splats, write_splats_with,
 };
 use irradia_scene::GaussianCloud;
 use irradia_splat::Splats;
@@ -183,8 +183,8 @@ impl Editing {
     }
 
     /// Overwrites the scene of its run with the edited one, and appends the edits to the run's `edits.toml`. The latest checkpoint is
-    /// edited in the same way: unchanged splats keep their moments, and the run resumes with the edited splats. Returns notes for the user,
-    /// a line each.
+    /// edited in the same way: unchanged splats keep their moments, and the run resumes with the edited splats. None of them is replaced
+    /// before all of them are written under temporary names. Returns notes for the user, a line each.
     ///
     /// # Errors
     /// When the scene is not a run's, the whole scene was moved away from its photographs, the run is training, the file of a split already
@@ -200,7 +200,8 @@ impl Editing {
                 "the whole scene would be moved away from its photographs: name another folder with -o".to_owned(),
             );
         }
-        if self.draft.visible_cloud().is_empty() {
+        let scene = self.draft.visible_cloud();
+        if scene.is_empty() {
             return refused("nothing would be left of the run: name an output with -o".to_owned());
         }
         let _lock = FolderLock::acquire(folder.path())?;
@@ -221,26 +222,30 @@ impl Editing {
             return refused(format!("split: {} exists already; choose another name", path.display()));
         }
         let mut notes = Vec::new();
+        let mut staged = Vec::new();
         if let Some(path) = folder.newest_checkpoint()? {
-            let kept = self.edit_checkpoint(&path)?;
+            let (bytes, kept) = self.edited_checkpoint(&path)?;
+            staged.push(StagedFile::write(&path, |out| out.write_all(&bytes))?);
             notes.push(format!("{}: {kept} splats keep their optimiser state", path.display()));
         }
+        staged.push(StagedFile::write(&self.path, |out| {
+            out.write_all(&encode_splats(SplatFormat::Ply, &scene, &WriteOptions::default())?)
+        })?);
+        staged.push(StagedFile::write(&folder.file(EDITS), |out| {
+            out.write_all(list.to_toml().as_bytes())
+        })?);
         for (path, cloud) in &splits {
             write_splats(path, cloud)?;
             notes.push(format!("{}: {} splats split off", path.display(), cloud.len()));
         }
-        notes.extend(write_scene(
-            &self.path,
-            &self.draft.visible_cloud(),
-            &WriteOptions::default(),
-        )?);
-        folder.write(EDITS, list.to_toml().as_bytes())?;
+        staged.into_iter().try_for_each(StagedFile::put_in_place)?;
+        remove_levels(&self.path)?;
         notes.push("the run's figures are from before the edit: run irradia eval to measure again".to_owned());
         Ok(notes)
     }
 
-    /// Applies the edits to a checkpoint. Returns the number of splats that keep their moments.
-    fn edit_checkpoint(&self, path: &Path) -> Result<usize, RunError> {
+    /// A checkpoint with the edits applied, and the number of splats that keep their moments.
+    fn edited_checkpoint(&self, path: &Path) -> Result<(Vec<u8>, usize), RunError> {
         let failed = |source| RunError::File {
             path: path.to_owned(),
             source,
@@ -264,8 +269,7 @@ impl Editing {
         let sources: Vec<Option<u32>> = shown.map(source).collect();
         let splats = Splats::from_cloud(&draft.visible_cloud());
         let bytes = with_splats(&bytes, &splats, &sources).map_err(failed)?;
-        write_atomic(path, |out| out.write_all(&bytes))?;
-        Ok(sources.iter().flatten().count())
+        Ok((bytes, sources.iter().flatten().count()))
     }
 
     /// The scenes that were split off and their files, beside `file`.

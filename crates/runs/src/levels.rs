@@ -61,10 +61,16 @@ pub(crate) fn level_files(path: &Path) -> impl Iterator<Item = PathBuf> {
 /// Writes a scene like [`write_splats_with`], and removes the levels beside it, which belong to the scene that it replaces.
 pub(crate) fn write_scene(path: &Path, cloud: &GaussianCloud, options: &WriteOptions) -> Result<Vec<String>, RunError> {
     let notes = write_splats_with(path, cloud, options)?;
+    remove_levels(path)?;
+    Ok(notes)
+}
+
+/// Removes the levels of the scene in the file `path`.
+pub(crate) fn remove_levels(path: &Path) -> Result<(), RunError> {
     for file in level_files(path).filter(|file| file.is_file()) {
         fs::remove_file(&file).map_err(RunError::io("remove", &file))?;
     }
-    Ok(notes)
+    Ok(())
 }
 
 /// Writes the levels of the scene `input` beside `output`, and compares them in views of its training cameras.
@@ -94,6 +100,7 @@ pub fn write_levels(input: &Path, output: &Path, options: &WriteOptions) -> Resu
         let count = whole.len().div_ceil(1 << level);
         last = merged(&last, count);
         let thinned: Vec<u32> = (0..whole.len() as u32).step_by(1 << level).collect();
+        let subsample = whole.gather(&thinned);
         let mut sums = [0.0; 3];
         for (camera, full) in cameras.iter().zip(&full) {
             let k = &camera.intrinsics;
@@ -103,7 +110,7 @@ pub fn write_levels(input: &Path, output: &Path, options: &WriteOptions) -> Resu
             };
             let [width, height] = [far.intrinsics.width, far.intrinsics.height];
             let shrunk = resize_area(full, 3, [k.width, k.height], [width, height]);
-            for (sum, splats) in sums.iter_mut().zip([&last, &whole.gather(&thinned), &whole]) {
+            for (sum, splats) in sums.iter_mut().zip([&last, &subsample, &whole]) {
                 *sum += psnr_8_bits(&picture(splats, &far), &shrunk, None).expect("a frame has pixels");
             }
         }

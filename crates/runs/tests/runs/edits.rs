@@ -218,6 +218,26 @@ fn a_run_edited_in_place_resumes_with_the_edited_splats() {
     assert!(error.contains(EDITS), "{error}");
     assert_eq!(fs::read(path.join(EDITS)).unwrap(), b"\xff");
     assert!(fs::read(path.join("scene.ply")).unwrap() == scene);
+    fs::remove_file(path.join(EDITS)).unwrap();
+    // A list that cannot be written leaves the checkpoint as it is, too.
+    #[cfg(unix)]
+    {
+        let checkpoints = || {
+            let files = fs::read_dir(path.join("checkpoints")).unwrap().flatten();
+            files
+                .map(|file| (file.path(), fs::read(file.path()).unwrap()))
+                .collect::<Vec<_>>()
+        };
+        let before = checkpoints();
+        std::os::unix::fs::symlink("/proc/no folder/list", path.join(EDITS)).unwrap();
+        let error = edited(&path, &["opacity factor=0.9 all"])
+            .write_in_place()
+            .expect_err("no folder")
+            .to_string();
+        assert!(error.contains("cannot"), "{error}");
+        assert!(checkpoints() == before && fs::read(path.join("scene.ply")).unwrap() == scene);
+        fs::remove_file(path.join(EDITS)).unwrap();
+    }
     fs::write(path.join(EDITS), list).unwrap();
 
     let request = TrainInput::of_run(&path).unwrap().check().unwrap();

@@ -268,16 +268,28 @@ impl RunFolder {
     }
 
     /// The views with which the run began; `None` if the run has no list.
+    ///
+    /// # Errors
+    /// When the list cannot be read or is damaged.
     fn views(&self) -> Result<Option<ViewList>, RunError> {
-        let path = self.file(VIEWS);
-        let Ok(text) = fs::read_to_string(&path) else {
+        let Some(bytes) = self.read_existing(VIEWS)? else {
             return Ok(None);
         };
-        let views = serde_json::from_str(&text).map_err(|error| RunError::Damaged {
-            path,
+        let views = serde_json::from_slice(&bytes).map_err(|error| RunError::Damaged {
+            path: self.file(VIEWS),
             reason: error.to_string(),
         })?;
         Ok(Some(views))
+    }
+
+    /// The content of a file; `None` if it does not exist.
+    fn read_existing(&self, name: &str) -> Result<Option<Vec<u8>>, RunError> {
+        let path = self.file(name);
+        match fs::read(&path) {
+            Ok(bytes) => Ok(Some(bytes)),
+            Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
+            Err(error) => Err(RunError::io("read", &path)(error)),
+        }
     }
 
     /// Differences between the views `now` and those with which the run began; empty if the run has no list.
@@ -382,15 +394,14 @@ impl RunFolder {
     /// # Errors
     /// When the file is damaged.
     pub(crate) fn world_from_dataset(&self) -> Result<Similarity, RunError> {
-        let path = self.file(WORLD);
-        let Ok(text) = fs::read_to_string(&path) else {
+        let Some(bytes) = self.read_existing(WORLD)? else {
             return Ok(Similarity::IDENTITY);
         };
         let damaged = |reason: String| RunError::Damaged {
-            path: path.clone(),
+            path: self.file(WORLD),
             reason,
         };
-        let record: WorldRecord = serde_json::from_str(&text).map_err(|error| damaged(error.to_string()))?;
+        let record: WorldRecord = serde_json::from_slice(&bytes).map_err(|error| damaged(error.to_string()))?;
         let world = Similarity {
             scale: record.scale,
             center: record.center.into(),

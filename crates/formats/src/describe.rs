@@ -65,15 +65,15 @@ impl fmt::Display for Description {
     }
 }
 
-/// Reads `path` and summarises it.
+/// Reads `path`, a dataset with `options`, and summarises it.
 ///
 /// # Errors
 /// Those of [`detect`] and of reading it.
-pub fn describe(path: &Path) -> Result<Description, FormatError> {
+pub fn describe(path: &Path, options: &DatasetOptions) -> Result<Description, FormatError> {
     Ok(match detect(path)? {
         Kind::Splats(_) => describe_splats(&read_splat_file(path)?),
         Kind::Points => describe_points(&read_points_ply(path)?),
-        Kind::Dataset(_) => describe_dataset(&read_dataset(path, &DatasetOptions::default())?),
+        Kind::Dataset(_) => describe_dataset(&read_dataset(path, options)?),
     })
 }
 

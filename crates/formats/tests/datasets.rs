@@ -337,7 +337,7 @@ fn nerfstudio_splits_points_and_frames_with_their_own_camera() {
     );
     assert_eq!(detect(&root.join("points.ply")).unwrap(), Kind::Points);
     assert!(
-        describe(&root.join("points.ply"))
+        describe(&root.join("points.ply"), &DatasetOptions::default())
             .unwrap()
             .to_string()
             .contains("2 points")

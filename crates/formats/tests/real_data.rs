@@ -295,7 +295,7 @@ fn splat_files_and_folders_are_described() {
         ("khr/khr_conformance_matrix.glb", "glTF with 15 Gaussians"),
     ] {
         assert!(matches!(detect(&path.join(name)).unwrap(), Kind::Splats(_)), "{name}");
-        let description = describe(&path.join(name)).unwrap();
+        let description = describe(&path.join(name), &DatasetOptions::default()).unwrap();
         assert_eq!(description.title, title);
         assert!(description.to_string().contains("SH degree") && description.warnings.is_empty());
     }

@@ -1,24 +1,36 @@
 //! Descriptions of files and folders.
 
-use crate::RunError;
 use crate::folder::{RESIDUAL, contains_run};
 use crate::scene_file::{is_field, read_field, residual_beside, scene_path};
+use crate::{Reading, ReadingOptions, RunError};
 use irradia_field::encoding::PositionEncoding;
 use irradia_field::{Field, Outside, Sampler};
-use irradia_formats::{Description, FormatError};
+use irradia_formats::{Description, FormatError, Kind, detect};
 use std::path::Path;
 
-/// A summary of the scene, run, dataset or point cloud at `path`.
+/// A summary of the scene, run, dataset or point cloud at `path`. A dataset is read with the options `reading`, at full size if they give
+/// no size.
 ///
 /// # Errors
-/// When it does not exist, cannot be read, is none of these, or is a run whose scene has not been written yet.
-pub fn describe(path: impl AsRef<Path>) -> Result<Description, RunError> {
+/// When it does not exist, cannot be read, is none of these, or is a run whose scene has not been written yet; when there are options for
+/// something that is not a dataset.
+pub fn describe(path: impl AsRef<Path>, reading: &ReadingOptions) -> Result<Description, RunError> {
     let scene = scene_path(path.as_ref());
+    let is_scene = is_field(&scene) || matches!(detect(&scene), Ok(Kind::Splats(_) | Kind::Points));
+    if is_scene && *reading != ReadingOptions::default() {
+        let message = format!("{} is not a dataset: omit the options for reading one", scene.display());
+        return Err(RunError::Refused(message));
+    }
+    let options = reading.with_fallback(Reading {
+        max_side: None,
+        ..Reading::default()
+    });
+    let options = options.check()?;
     if is_field(&scene) {
         let bytes = std::fs::metadata(&scene).map_or(0, |file| file.len());
         return Ok(describe_field(&read_field(&scene)?, bytes));
     }
-    let mut description = irradia_formats::describe(&scene).map_err(|error| {
+    let mut description = irradia_formats::describe(&scene, &options).map_err(|error| {
         if scene.is_dir() && contains_run(&scene) {
             FormatError::NoScene(scene.clone())
         } else {

@@ -110,7 +110,7 @@ pub mod prelude {
     pub use crate::train::event::{Event, Observer, Signal};
     pub use crate::train::{Recipe, Trainer};
     pub use crate::{
-        Background, Finished, Reading, Run, RunError, RunFolder, Scene, Snapshot, Snapshots, TrainInput, TrainRequest,
-        describe, evaluate, write_image, write_synth_dataset,
+        Background, Finished, Reading, ReadingOptions, Run, RunError, RunFolder, Scene, Snapshot, Snapshots,
+        TrainInput, TrainRequest, describe, evaluate, write_image, write_synth_dataset,
     };
 }

@@ -84,12 +84,20 @@ pub fn run(args: &Args) -> Result<()> {
         if film::kind(&args.out).is_some() {
             return write_film(args, &scene, &film);
         }
+        let frame_name = |i: usize| format!("frame_{i:04}");
+        let count = film.cameras.len();
         let cameras = film.cameras.into_iter().enumerate();
-        return write_frames(
+        write_frames(
             args,
             &scene,
-            cameras.map(|(i, camera)| (format!("frame_{i:04}"), camera)).collect(),
-        );
+            cameras.map(|(i, camera)| (frame_name(i), camera)).collect(),
+        )?;
+        let next = args.out.join(frame_name(count) + ".png");
+        if next.exists() {
+            let next = next.display();
+            warn(&[format!("{next} and later frames are of an earlier, longer path")]);
+        }
+        return Ok(());
     }
     let data = args.data.as_ref().expect("clap requires one of them");
     let dataset = args.reading.options().read_for(&scene, &args.scene, data);

@@ -27,6 +27,18 @@ fn paths_become_frames_and_films() {
 }
 
 #[test]
+fn frames_that_an_earlier_path_left_are_reported() {
+    let folder = with_run();
+    let rendered = |frames: u32| {
+        let line = format!("render run --orbit {frames} --size 8x6 --out frames");
+        irradia(folder.path(), &line).success().stderr
+    };
+    assert!(!rendered(3).contains("earlier"));
+    let said = rendered(2);
+    assert!(said.contains("frame_0002.png and later frames"), "{said}");
+}
+
+#[test]
 fn a_saved_path_shows_the_same_of_a_scene_that_was_moved() {
     let folder = with_run();
     let camera = &json(&folder.path().join("run/cameras.json"))[3];

@@ -4,6 +4,19 @@ use crate::process::*;
 use std::fs;
 
 #[test]
+fn info_reads_datasets_with_the_options_of_training() {
+    let folder = with_run();
+    let info = |line: &str| irradia(folder.path(), &format!("info {line}"));
+    let [whole, half] = ["data", "data --downscale 2"].map(|line| info(line).success().stdout);
+    assert!(whole != half && half.contains("image size"), "{half}");
+    let none = info("data --holdout 0").success().stdout;
+    assert!(none.contains(", 0\n"), "{none}");
+    info("data --format colmap").refused(1, &["no dataset found", "COLMAP"]);
+    info("data --max-side 0").refused(2, &["--max-side"]);
+    info("run --downscale 2").refused(2, &["not a dataset"]);
+}
+
+#[test]
 fn a_run_contains_all_outputs() {
     let folder = with_run();
     let run = folder.path().join("run");

@@ -41,7 +41,12 @@ fn a_scene_takes_background_and_cameras_from_its_run_if_it_has_one() {
     assert!(outside.cameras.is_none() && outside.model.splats() == inside.model.splats());
     let camera = outside.orbit(1, Some((32, 20)))[0];
     assert_eq!((camera.intrinsics.width, camera.intrinsics.height), (32, 20));
-    assert!(describe(&path).expect("known").title.contains("Gaussians"));
+    assert!(
+        describe(&path, &ReadingOptions::default())
+            .expect("known")
+            .title
+            .contains("Gaussians")
+    );
 
     let error = Scene::read(folder.path().join("none.ply")).expect_err("absent");
     assert!(error.to_string().contains("none.ply") && !error.is_request(), "{error}");

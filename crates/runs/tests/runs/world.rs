@@ -115,7 +115,9 @@ fn a_dataset_in_millimetres_500_km_away_trains_alike_and_is_exported_to_the_mill
 
     let data = Reading::default().read(&folder.path().join("far")).unwrap();
     assert!(data.world_from_dataset == world);
-    let description = describe(folder.path().join("far")).unwrap().to_string();
+    let description = describe(folder.path().join("far"), &ReadingOptions::default())
+        .unwrap()
+        .to_string();
     assert!(description.contains("in units of 1000"), "{description}");
 }
 

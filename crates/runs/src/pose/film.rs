@@ -2,7 +2,7 @@
 
 use super::PoseProgress;
 use super::capture::prepare_folder;
-use crate::RunError;
+use crate::{RunError, distinct};
 use irradia_formats::write_atomic;
 use irradia_sfm::Features;
 use irradia_sfm::features::{Extractor, GreyPhoto, Sift};
@@ -117,11 +117,10 @@ pub(super) fn write_frames(
         .iter()
         .map(|film| empty_selection(film))
         .collect::<Result<Vec<_>, _>>()?;
-    for i in 0..chosen.len() {
-        // Films in different folders may have the same name.
-        if chosen[..i].iter().any(|other| other.stem == chosen[i].stem) {
-            chosen[i].stem = format!("{}_{}", chosen[i].stem, i + 1);
-        }
+    // Films in different folders may have the same name.
+    let stems = distinct(chosen.iter().map(|chosen| chosen.stem.clone()));
+    for (chosen, stem) in chosen.iter_mut().zip(stems) {
+        chosen.stem = stem;
     }
     let known: Option<Vec<ChosenFrames>> = fs::read(&record)
         .ok()

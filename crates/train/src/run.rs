@@ -93,7 +93,7 @@ pub fn run(
     let mut events = begin_events(trainer);
     let mut forecast = Forecast::default();
     let mut requests = notify(trainer, &mut events, observers);
-    wait_while_paused(trainer, &mut requests, &mut events, observers);
+    wait_while_paused(trainer, &mut requests, &mut events, observers)?;
     let mut reason = None;
     // Loading for the first splats is not part of the steps.
     trainer.photos.take_seconds();
@@ -135,7 +135,7 @@ pub fn run(
         }
         if reason.is_none() && !trainer.finished() {
             let started = Instant::now();
-            wait_while_paused(trainer, &mut requests, &mut events, observers);
+            wait_while_paused(trainer, &mut requests, &mut events, observers)?;
             trainer.times.paused += started.elapsed().as_secs_f64();
         }
         trainer.times.wall = before + began.elapsed().as_secs_f64();
@@ -304,14 +304,17 @@ fn notify(trainer: &Trainer, events: &mut Vec<Event>, observers: &mut [&mut dyn 
 }
 
 /// Waits while an observer requests a pause and none requests a stop.
+///
+/// # Errors
+/// When the device has failed and an observer requests a checkpoint.
 fn wait_while_paused(
     trainer: &Trainer,
     requests: &mut Requests,
     events: &mut Vec<Event>,
     observers: &mut [&mut dyn Observer],
-) {
+) -> Result<(), TrainError> {
     if !requests.pause || requests.stop {
-        return;
+        return Ok(());
     }
     let step = trainer.clock.step;
     events.push(Event::Paused { step });
@@ -323,12 +326,14 @@ fn wait_while_paused(
             requests.add(observer.while_paused(trainer));
         }
         if requests.save || requests.stop {
+            trainer.read_back()?;
             save(trainer, events, observers);
             requests.stop |= notify(trainer, events, observers).stop;
         }
     }
     events.push(Event::Resumed { step });
     requests.stop |= notify(trainer, events, observers).stop;
+    Ok(())
 }
 
 /// At most [`MAX_EVALUATED`] of `views`, evenly spaced.

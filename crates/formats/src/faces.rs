@@ -21,6 +21,9 @@ const MIN_SHOWN_FRACTION: f64 = 0.7;
 const SAMPLES_PER_SIDE: u32 = 48;
 /// Minimum side of a face relative to that of the cube: a smaller face is a strip that only costs time.
 const MIN_FACE_FRACTION: f64 = 1.0 / 8.0;
+/// Maximum side of the cube relative to the longer side of the photograph. Beyond it, a photograph shows less than 30 degrees, and one
+/// image shows all of it, unless its focal length is wrong.
+const MAX_CUBE_FRACTION: f64 = 4.0;
 /// Longer side of the small copies in which the image circle is searched, pixels.
 const CIRCLE_IMAGE_SIDE: u32 = 256;
 /// Maximum value, of 255, of the black around an image circle.
@@ -116,6 +119,9 @@ fn shown_fraction(source: &Intrinsics, max_angle: f64, plan: &Undistortion) -> f
 fn plan_faces(source: &Intrinsics, max_angle: f64) -> Vec<(&'static str, Undistortion)> {
     let focal = 0.5 * (source.fx + source.fy);
     let side = (2.0 * focal).round().max(1.0) as u32;
+    if f64::from(side) > MAX_CUBE_FRACTION * f64::from(source.width.max(source.height)) {
+        return Vec::new();
+    }
     let pinhole = Intrinsics::from_fov_x(side, side, FRAC_PI_2 as f32);
     let face = |(name, rotation): CubeFace| {
         // The back face of a camera that does not see straight behind itself would have a hole.
@@ -342,6 +348,17 @@ mod tests {
                 "{name} {width}x{height}"
             );
         }
+    }
+
+    #[test]
+    fn focal_lengths_that_are_far_too_long_leave_no_image() {
+        let lens = Lens::Fisheye {
+            k: [0.0; 4],
+            p: [0.0, 1e20],
+            s: [0.0; 2],
+        };
+        let k = camera(lens, 40, 30, [1e6; 2]);
+        assert_eq!(PinholeImages::plan(&k, || None), None);
     }
 
     #[test]

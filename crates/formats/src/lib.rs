@@ -44,8 +44,8 @@ pub use error::{FormatError, Malformed};
 pub use image_file::{Pixels, read_image, write_png, write_png_16};
 pub use pack::gzip;
 pub use photos::{
-    CameraTags, PanoramaFace, PhotoEntry, PhotoFolder, find_panoramas, photo_files, read_photo_folder,
-    read_photo_folders,
+    CameraTags, PanoramaFace, PhotoEntry, PhotoFolder, find_panoramas, photo_files, read_chosen_photos,
+    read_photo_folder, read_photo_folders,
 };
 pub use points_ply::{read_points_ply, write_points_ply};
 pub use splats::{

@@ -4,7 +4,8 @@ use exif::{Field, In, Tag, Value};
 use glam::DVec3;
 use irradia_formats::{ColmapCamera, ColmapImage, ColmapModel, PosedImage, write_colmap};
 use irradia_formats::{
-    DatasetOptions, find_panoramas, photo_files, read_dataset, read_photo_folder, read_photo_folders,
+    DatasetOptions, find_panoramas, photo_files, read_chosen_photos, read_dataset, read_photo_folder,
+    read_photo_folders,
 };
 use std::fs;
 use std::path::Path;
@@ -391,18 +392,23 @@ fn panoramas_are_found_and_cut_into_faces() {
 #[test]
 fn folders_are_read_together_and_names_stay_apart() {
     let root = tempfile::tempdir().unwrap();
-    let [first, second] = ["first", "second"].map(|name| root.path().join(name));
-    for (folder, red) in [(&first, 10), (&second, 90)] {
+    let folders = ["first", "second"].map(|name| root.path().join(name));
+    let [first, second] = &folders;
+    for (folder, red) in [(first, 10), (second, 90)] {
         fs::create_dir(folder).unwrap();
         picture(40, 30, red).save(folder.join("1.png")).unwrap();
     }
     picture(40, 30, 200).save(second.join("2.png")).unwrap();
     fs::copy(first.join("1.png"), second.join("3.png")).unwrap();
-    let found = read_photo_folders(&[first, second]).unwrap();
+    let found = read_photo_folders(&folders).unwrap();
     let names: Vec<&str> = found.photos.iter().map(|photo| photo.name.as_str()).collect();
     assert_eq!(names, ["2.png", "3.png", "second_1.png"]);
     assert!(found.left_out.is_empty());
     assert!(found.repeated[0].0 == "first_1.png" && found.repeated[0].1.contains("copy of 3.png"));
+    // Photographs that are not chosen have no influence on the others.
+    let found = read_chosen_photos(&folders, &|file| !file.ends_with("second/1.png")).unwrap();
+    let names: Vec<&str> = found.photos.iter().map(|photo| photo.name.as_str()).collect();
+    assert_eq!(names, ["1.png", "2.png"]);
 }
 
 #[test]

@@ -68,7 +68,7 @@ mod scene_file;
 mod snapshot;
 mod synth_files;
 
-pub use background::Background;
+pub use background::{Background, is_rendered};
 pub use cameras::{camera_names, is_moved, moved_from_dataset, moved_from_run, write_own_cameras};
 pub use compact::{CompactEvent, CompactInput, CompactTarget, Compacted, compact};
 pub use convert::{COMPARED_VIEWS, Conversion, convert};
@@ -91,7 +91,7 @@ pub use photographs::photographs_of;
 pub use pose::{
     AttemptReport, CameraReport, DoctorInput, DoctorReport, Finding, KnownDistance, LeftOutPhoto, MIN_POSED_FRACTION,
     Mapper, PoseCheck, PoseInput, PoseProgress, PoseReport, PoseSource, ScaleReport, StageReport, check_poses, doctor,
-    group_by_reason, is_capture, is_film_name, pose, pose_source,
+    group_by_reason, is_capture, is_film_name, photographs_in, pose, pose_source,
 };
 pub use protocol::Protocol;
 pub use provenance::{data_fingerprint, program_fingerprint};

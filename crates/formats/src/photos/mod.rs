@@ -184,6 +184,17 @@ pub fn read_photo_folder(folder: &Path) -> Result<PhotoFolder, FormatError> {
 /// # Errors
 /// When a folder cannot be read.
 pub fn read_photo_folders(folders: &[impl AsRef<Path>]) -> Result<PhotoFolder, FormatError> {
+    read_chosen_photos(folders, &|_| true)
+}
+
+/// Like [`read_photo_folders`], as if the folders had no other photographs than those whose files `is_chosen`.
+///
+/// # Errors
+/// When a folder cannot be read.
+pub fn read_chosen_photos(
+    folders: &[impl AsRef<Path>],
+    is_chosen: &dyn Fn(&Path) -> bool,
+) -> Result<PhotoFolder, FormatError> {
     let mut files: Vec<PhotoFiles> = Vec::new();
     let mut result = PhotoFolder::default();
     for folder in folders.iter().map(AsRef::as_ref) {
@@ -198,7 +209,7 @@ pub fn read_photo_folders(folders: &[impl AsRef<Path>]) -> Result<PhotoFolder, F
             SiblingFolder::depths(&root),
             SiblingFolder::normals(&root),
         ];
-        files.extend(new_files.into_iter().map(|path| {
+        files.extend(new_files.into_iter().filter(|path| is_chosen(path)).map(|path| {
             let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
             let files = siblings
                 .each_ref()

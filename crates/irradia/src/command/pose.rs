@@ -10,9 +10,9 @@ use irradia_runs::formats::{DatasetFormat, write_atomic};
 use irradia_runs::scene::Dataset;
 use irradia_runs::{
     Finding, KnownDistance, MIN_POSED_FRACTION, Mapper, POSED_FOLDER, PoseInput, PoseProgress, PoseReport, TrainInput,
-    group_by_reason, is_capture, pose,
+    group_by_reason, is_capture, photographs_in, pose,
 };
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
@@ -159,6 +159,12 @@ pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses, anywa
     if let Some(images) = input.reading.images.take() {
         input.data = images;
     }
+    if input.data.is_file()
+        && let Some(folder) = input.data.parent()
+    {
+        // The file that describes the dataset.
+        input.data = folder.to_owned();
+    }
     input.reading.format = None;
     let names_of = |views: &[usize]| -> Vec<String> {
         let names = views.iter().map(|view| bare_name(&dataset.views[*view].name));
@@ -173,7 +179,7 @@ pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses, anywa
         ))
         .into());
     }
-    let report = pose_into_run(input, poses, Some(listed))?;
+    let report = pose_into_run(input, poses, files_of(dataset, &input.data))?;
     let left_out: HashSet<&str> = report.left_out.iter().map(|left| bare_name(&left.name)).collect();
     let is_lost = |name: &&String| left_out.contains(name.as_str());
     let held_out: Vec<&str> = test.iter().filter(|name| !is_lost(name)).map(String::as_str).collect();
@@ -196,6 +202,24 @@ pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses, anywa
     Ok(())
 }
 
+/// The files below `folder` of the photographs that `dataset` trains on or holds out; `None` if that of a view cannot be told.
+fn files_of(dataset: &Dataset, folder: &Path) -> Option<HashSet<PathBuf>> {
+    let mut by_name: HashMap<String, Vec<PathBuf>> = HashMap::new();
+    for file in photographs_in(folder) {
+        let name = file.file_name().unwrap_or_default().to_string_lossy();
+        by_name.entry(bare_name(&name).to_owned()).or_default().push(file);
+    }
+    let file_of = |name: &str| {
+        let files = by_name.get(bare_name(name))?;
+        // Other folders may have photographs of the same name.
+        let is_exact = |file: &&PathBuf| file.with_extension("").ends_with(Path::new(name).with_extension(""));
+        let exact = files.iter().find(is_exact);
+        exact.or(files.first().filter(|_| files.len() == 1)).cloned()
+    };
+    let used = dataset.train.iter().chain(&dataset.test);
+    used.map(|view| file_of(&dataset.views[*view].name)).collect()
+}
+
 /// The last part of a view's name, without extension: a dataset may name photographs with the extension that they had before a conversion.
 fn bare_name(name: &str) -> &str {
     let last = name.rsplit('/').next().unwrap_or(name);
@@ -203,7 +227,7 @@ fn bare_name(name: &str) -> &str {
 }
 
 /// Poses the photographs of `input`, or `only` some, into the folder `posed` of its run, and makes that its dataset.
-fn pose_into_run(input: &mut TrainInput, poses: Poses, only: Option<HashSet<String>>) -> Result<PoseReport> {
+fn pose_into_run(input: &mut TrainInput, poses: Poses, only: Option<HashSet<PathBuf>>) -> Result<PoseReport> {
     let posed = input.out.join(POSED_FOLDER);
     note(format_args!("finding poses, which are written to {}", posed.display()));
     let data = std::mem::replace(&mut input.data, posed.clone());

@@ -16,8 +16,8 @@ use irradia_runs::formats::DatasetFormat;
 use irradia_runs::scene::Dataset;
 use irradia_runs::{
     Background, DEFAULT_RECIPE, Finished, NOT_MEASURED, PoseCheck, PoseSource, Reading, Run, RunError, RunFolder,
-    TrainInput, TrainRequest, check_poses, has_perceptual_loss, moved_from_dataset, pose_source, read_recipe,
-    scene_path,
+    TrainInput, TrainRequest, check_poses, has_perceptual_loss, is_rendered, moved_from_dataset, pose_source,
+    read_recipe, scene_path,
 };
 use irradia_train::event::Observer;
 use std::path::{Path, PathBuf};
@@ -312,7 +312,7 @@ fn with_poses(input: TrainInput, poses: Option<PosesArg>, anyway: bool) -> Resul
         return read(again);
     }
     // Rendered scenes are exact, and our own poses have been checked.
-    let is_sure = given.1.kind == "Blender" || pose_source(&input.data) == Some(PoseSource::Irradia);
+    let is_sure = is_rendered(&given.1) || pose_source(&input.data) == Some(PoseSource::Irradia);
     if poses.is_some() || is_sure {
         return Ok(given);
     }

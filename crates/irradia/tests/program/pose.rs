@@ -2,6 +2,7 @@
 
 use crate::process::*;
 use irradia_testkit::shared;
+use serde_json::json;
 use std::fs;
 use std::path::Path;
 
@@ -74,6 +75,50 @@ fn given_poses_that_photographs_contradict_are_replaced_and_others_are_on_reques
     };
     assert_eq!(names("again"), names("sound"));
     irradia(folder.path(), "train can/images --out none --poses given").refused(2, &["no poses", "--poses given"]);
+}
+
+/// The layout of Blender scenes, with opaque photographs, some of them in two folders.
+#[test]
+fn photographs_laid_out_like_a_rendered_scene_have_their_poses_checked_and_keep_their_split() {
+    let Some(door) = shared("data/lund_door/images") else {
+        return;
+    };
+    let folder = tempfile::tempdir().expect("a folder");
+    let here = |name: &str| folder.path().join("door").join(name);
+    copy(&door, &here("train"), 12);
+    for name in ["test", "val"] {
+        fs::create_dir(here(name)).expect("a folder");
+    }
+    for name in ["DSC_0004.JPG", "DSC_0009.JPG"] {
+        fs::rename(here("train").join(name), here("test").join(name)).expect("moved");
+        fs::copy(here("test").join(name), here("val").join(name)).expect("copied");
+    }
+    for split in ["train", "test"] {
+        let files = fs::read_dir(here(split)).expect("a folder");
+        let mut names: Vec<_> = files
+            .map(|file| file.expect("a file").file_name().to_string_lossy().into_owned())
+            .collect();
+        names.sort();
+        let frame = |(i, name): (usize, &String)| {
+            let x = 7 * i % 10;
+            let pose = json!([[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]);
+            json!({ "file_path": format!("./{split}/{name}"), "transform_matrix": pose })
+        };
+        let frames: Vec<_> = names.iter().enumerate().map(frame).collect();
+        let transforms = json!({ "camera_angle_x": 0.9, "frames": frames });
+        fs::write(here(&format!("transforms_{split}.json")), transforms.to_string()).expect("written");
+    }
+    let trained = irradia(folder.path(), "train door --out run --steps 2 --max-side 120").success();
+    assert!(trained.stderr.contains("contradict the given poses"), "{trained:#?}");
+    let report = json(&folder.path().join("run/report.json"));
+    assert!(report["warnings"].to_string().contains("new ones are used"), "{report}");
+    let names: Vec<_> = report["views"]
+        .as_array()
+        .expect("a list")
+        .iter()
+        .map(|view| &view["name"])
+        .collect();
+    assert_eq!(names, ["images/DSC_0004.JPG", "images/DSC_0009.JPG"]);
 }
 
 #[test]

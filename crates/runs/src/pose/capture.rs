@@ -6,8 +6,8 @@ use crate::RunError;
 use crate::scene_file::same_file;
 use glam::{DQuat, DVec3};
 use irradia_formats::{
-    DatasetFormat, FormatError, PanoramaFace, PhotoEntry, PhotoFolder, find_panoramas, photo_files, read_photo_folder,
-    read_photo_folders, write_atomic,
+    DatasetFormat, FormatError, PanoramaFace, PhotoEntry, PhotoFolder, find_panoramas, photo_files, read_chosen_photos,
+    read_photo_folder, write_atomic,
 };
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::map::{PhotoInfo, RigMount};
@@ -97,6 +97,14 @@ pub fn is_capture(path: &Path) -> bool {
     sources.add(path, None, MAX_FOLDER_DEPTH).is_ok() && sources != Sources::default()
 }
 
+/// The files of the photographs that [`super::pose`] finds at `path`.
+pub fn photographs_in(path: &Path) -> Vec<PathBuf> {
+    let mut sources = Sources::default();
+    // What cannot be read has no photographs.
+    let _ = sources.add(path, None, MAX_FOLDER_DEPTH);
+    sources.folders.iter().flat_map(|folder| photo_files(folder)).collect()
+}
+
 /// Creates a folder with an empty record, or empties it if its record shows that an earlier call wrote it.
 ///
 /// # Errors
@@ -129,13 +137,14 @@ pub(super) struct Capture {
 }
 
 impl Capture {
-    /// Reads the photographs, films and panoramas in `paths`. Frames and faces are written into subfolders of `out`, to whose dataset the
+    /// Reads the photographs, films and panoramas in `paths`, of the photographs those whose files `is_chosen`. Frames and faces are written into subfolders of `out`, to whose dataset the
     /// photographs are to be added if `into`.
     ///
     /// # Errors
     /// When a path or a film cannot be read, frames or faces cannot be written, for instance without `out`, or panoramas are to be added.
     pub fn read(
         paths: &[PathBuf],
+        is_chosen: &dyn Fn(&Path) -> bool,
         out: Option<&Path>,
         into: bool,
         progress: &(dyn Fn(PoseProgress) + Sync),
@@ -175,7 +184,7 @@ impl Capture {
             sources.folders.push(folder);
         }
         let mut capture = Self {
-            folder: read_photo_folders(&sources.folders)?,
+            folder: read_chosen_photos(&sources.folders, is_chosen)?,
             has_films: !sources.films.is_empty(),
             faces: HashMap::new(),
         };
@@ -383,7 +392,7 @@ mod tests {
         prepare_folder(&out.join(FACES_FOLDER), FACES_RECORD).unwrap();
         let face = out.join(FACES_FOLDER).join("0_front.jpg");
         fs::write(&face, "written by an earlier call").unwrap();
-        let error = Capture::read(&[photos], Some(&out), true, &|_| ())
+        let error = Capture::read(&[photos], &|_| true, Some(&out), true, &|_| ())
             .unwrap_err()
             .to_string();
         assert!(error.contains("panoramas cannot be added"), "{error}");

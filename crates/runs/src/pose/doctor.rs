@@ -113,7 +113,7 @@ pub fn doctor(input: &DoctorInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> 
     if let Some(out) = &input.out {
         fs::create_dir_all(out).map_err(RunError::io("create", out))?;
     }
-    let capture = Capture::read(&input.photos, input.out.as_deref(), false, progress)?;
+    let capture = Capture::read(&input.photos, &|_| true, input.out.as_deref(), false, progress)?;
     let folder = &capture.folder;
     check_photo_count(&input.photos, folder)?;
     let mut work = Work::new(input.max_features, input.out.as_deref(), folder, progress);

@@ -31,7 +31,7 @@ use crate::RunError;
 use crate::folder::to_json;
 use attempt::{Attempt, Matched};
 use capture::Capture;
-use irradia_formats::{PhotoEntry, PhotoFolder, write_atomic};
+use irradia_formats::{PhotoFolder, write_atomic};
 use irradia_sfm::doctor::Kind;
 use irradia_sfm::map::{MapOptions, PhotoInfo, Reconstruction};
 use known::KnownPoses;
@@ -43,7 +43,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 use still::Masked;
 
-pub use capture::is_capture;
+pub use capture::{is_capture, photographs_in};
 pub use check::{PoseCheck, check_poses};
 pub use doctor::{DoctorInput, DoctorReport, Finding, doctor};
 use film::is_film;
@@ -64,9 +64,8 @@ pub struct PoseInput {
     pub photos: Vec<PathBuf>,
     /// The folder of the dataset; created if missing.
     pub out: PathBuf,
-    /// File names of the photographs to use, each with or without its extension; others beside them are ignored. Has no effect unless all of
-    /// them are found. `None`: all.
-    pub only: Option<HashSet<String>>,
+    /// The files of the photographs to use, as [`photographs_in`] names them; others beside them are ignored. `None`: all.
+    pub only: Option<HashSet<PathBuf>>,
     /// Whether to add the photographs to the dataset in `out`, in COLMAP's format, whose poses and cameras do not change.
     pub into: bool,
     /// Known distances between cameras, by which the poses are scaled to metres.
@@ -343,15 +342,9 @@ fn read_capture(
     known: Option<&KnownPoses>,
     progress: &(dyn Fn(PoseProgress) + Sync),
 ) -> Result<Capture, RunError> {
-    let mut capture = Capture::read(&input.photos, Some(&input.out), input.into, progress)?;
+    let is_chosen = |path: &Path| input.only.as_ref().is_none_or(|only| only.contains(path));
+    let mut capture = Capture::read(&input.photos, &is_chosen, Some(&input.out), input.into, progress)?;
     still::ignore_own_masks(&mut capture.folder.photos, &input.out)?;
-    if let Some(only) = &input.only {
-        let bare = |name: &str| name.rsplit_once('.').map_or(name, |(bare, _)| bare).to_owned();
-        let is_one = |photo: &PhotoEntry| only.contains(&photo.name) || only.contains(&bare(&photo.name));
-        if capture.folder.photos.iter().filter(|photo| is_one(photo)).count() == only.len() {
-            capture.folder.photos.retain(is_one);
-        }
-    }
     if let Some(known) = known {
         capture.folder = known.combined_with(capture.folder)?;
     }

@@ -6,6 +6,7 @@
 use super::output::mean_color;
 use super::stages::max_features;
 use super::view_features::{ViewFeatures, pose};
+use crate::background::is_rendered;
 use irradia_scene::{Dataset, Lens, PointCloud};
 use irradia_sfm::features::Sift;
 use irradia_sfm::map::{KnownGeometry, MapOptions, PhotoInfo, add_guided_points, extend};
@@ -24,7 +25,7 @@ const MAX_GUIDED_PHOTOS: usize = 25;
 /// Whether points should be found for `dataset`: it has none and was not rendered. In rendered datasets, empty space is known, and poses
 /// may be arbitrary.
 pub(crate) fn lacks_points(dataset: &Dataset) -> bool {
-    dataset.points.as_ref().is_none_or(PointCloud::is_empty) && dataset.kind != "Blender"
+    dataset.points.as_ref().is_none_or(PointCloud::is_empty) && !is_rendered(dataset)
 }
 
 /// Adds points from matches of the training photographs to `dataset`, in its world, and records in each view which of them it shows.

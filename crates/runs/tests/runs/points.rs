@@ -123,17 +123,26 @@ fn points_are_not_found_where_they_are_given_not_wanted_or_nothing_matches() {
     };
     assert_eq!(points_of("given", &given, true), (points, vec![]));
     assert_eq!(points_of("unwanted", &bare, false), (None, vec![]));
-    for view in &mut bare.views {
-        view.photo = Arc::new(Photo {
-            width: OPTIONS.width,
-            height: OPTIONS.height,
-            channels: 3,
-            data: vec![90; 3 * (OPTIONS.width * OPTIONS.height) as usize],
-            mask: None,
-        });
+    let mut fill = |channels: u32| {
+        for view in &mut bare.views {
+            view.photo = Arc::new(Photo {
+                width: OPTIONS.width,
+                height: OPTIONS.height,
+                channels,
+                data: vec![90; (channels * OPTIONS.width * OPTIONS.height) as usize],
+                mask: None,
+            });
+        }
+        bare.clone()
+    };
+    let (grey, transparent) = (fill(3), fill(4));
+    let blender = |dataset: &Dataset| Dataset {
+        kind: "Blender".into(),
+        ..dataset.clone()
+    };
+    for (name, dataset) in [("grey", grey.clone()), ("photographs", blender(&grey))] {
+        let (points, messages) = points_of(name, &dataset, true);
+        assert!(points.is_none() && messages[0].contains("too few"), "{messages:?}");
     }
-    let (points, messages) = points_of("grey", &bare, true);
-    assert!(points.is_none() && messages[0].contains("too few"), "{messages:?}");
-    bare.kind = "Blender".into();
-    assert_eq!(points_of("rendered", &bare, true), (None, vec![]));
+    assert_eq!(points_of("rendered", &blender(&transparent), true), (None, vec![]));
 }

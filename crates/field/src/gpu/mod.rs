@@ -57,6 +57,8 @@ pub(crate) struct GpuField {
     pub kernels: Kernels,
     pub layout: Layout,
     steps: Steps,
+    /// Number of rays in the last march, by which `middles` is laid out: rays may be left out afterwards.
+    marched: usize,
     /// Maximum number of samples per ray in the last march.
     samples_per_ray: usize,
     /// The field's part of `Task` in `task.wgsl`.
@@ -85,7 +87,7 @@ pub(crate) struct GpuField {
 
 struct TaskOfField {
     space: [u32; 4],
-    rows: [u32; 4],
+    rows: [u32; 3],
     march: [u32; 4],
     levels: Vec<[u32; 4]>,
 }
@@ -123,7 +125,7 @@ impl GpuField {
         let floats = [options.steps.shortest, options.steps.cone, net.shape.density_bias, 0.0];
         let task_of_field = TaskOfField {
             space: [side as u32, u32::from(is_contracted), activation, coefficients as u32],
-            rows: [layout.density_row, layout.direction_row, layout.rgb_row, 0].map(|row| row as u32),
+            rows: [layout.density_row, layout.direction_row, layout.rgb_row].map(|row| row as u32),
             march: floats.map(f32::to_bits),
             levels: net
                 .levels
@@ -139,6 +141,7 @@ impl GpuField {
         let made = Self {
             kernels: Kernels::new(&gpu, &layout.constants(net)),
             steps: options.steps,
+            marched: 0,
             samples_per_ray: 0,
             task_of_field,
             table: Array::zeros(&gpu, "the hash table's entries", parameters.table.len()),
@@ -187,7 +190,7 @@ impl GpuField {
         let rays = batch.rays.len();
         self.rays.reserve(&gpu, RAY_WORDS * rays);
         self.rays.write(&gpu, 0, batch.rays.as_flattened());
-        self.samples_per_ray = self.max_samples(batch);
+        (self.marched, self.samples_per_ray) = (rays, self.max_samples(batch));
         self.middles.reserve(&gpu, self.samples_per_ray * rays);
         self.counts.reserve(&gpu, rays + 1);
         self.starts.reserve(&gpu, rays + 1);
@@ -343,8 +346,10 @@ impl GpuField {
     fn write_task(&self, rays: usize, samples: usize, weights: [f32; 2]) {
         let of = &self.task_of_field;
         let sizes = [rays, samples, self.stride, self.samples_per_ray].map(|n| n as u32);
+        let [density, direction, rgb] = of.rows;
+        let rows = [density, direction, rgb, self.marched as u32];
         let loss = [weights[0], weights[1], 0.0, 0.0].map(f32::to_bits);
-        let mut words = vec![sizes, of.space, of.rows, of.march, loss];
+        let mut words = vec![sizes, of.space, rows, of.march, loss];
         words.extend_from_slice(&of.levels);
         self.task.write(&self.gpu, 0, &words);
     }

@@ -230,6 +230,36 @@ fn rays_beyond_the_most_samples_are_left_out() {
 }
 
 #[test]
+fn rays_that_remain_keep_their_samples() {
+    let Some(gpu) = gpu() else { return };
+    let (_, config, space) = variants().into_iter().next().expect("a variant");
+    let field = state(config, space).field;
+    let mut on_device = GpuField::new(gpu.clone(), &field).unwrap();
+    let rays = Photographs::new().batch(0, &space).rays;
+    let mut middles = |max_samples: usize| {
+        let mut batch = Batch {
+            rays: rays
+                .iter()
+                .map(|ray| GpuField::ray(ray, 0.5, [0.0; 4], [0.0; 4]))
+                .collect(),
+            weights: [1.0, 0.0],
+        };
+        let samples = on_device.march_within(&mut batch, max_samples);
+        on_device.prepare(&batch, samples);
+        let mut work = Work::new(&gpu);
+        on_device.evaluate(&mut work, batch.rays.len(), samples);
+        work.submit();
+        let mut middles = vec![0.0f32; samples];
+        on_device.points.read(&gpu, 3 * on_device.stride, &mut middles);
+        middles
+    };
+    let (all, some) = (middles(usize::MAX), middles(300));
+    gpu.check().unwrap();
+    assert!((200..=300).contains(&some.len()) && all.len() > 500);
+    assert_eq!(some, all[..some.len()]);
+}
+
+#[test]
 fn two_trainings_on_the_device_have_the_same_bytes() {
     let Some(gpu) = gpu() else { return };
     let photographs = Photographs::new();

@@ -20,7 +20,7 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
     let stride = task.sizes.z;
     for (var i = 0u; i < count; i++) {
         let s = first + i;
-        let middle = middles[i * task.sizes.x + r];
+        let middle = middles[i * task.rows.w + r];
         let u = unit(ray.origin + middle * ray.direction);
         points[s] = u.x;
         points[stride + s] = u.y;

@@ -6,7 +6,7 @@
 @group(0) @binding(2) var<storage, read> bricks: array<u32>;
 @group(0) @binding(3) var<storage, read> table: array<f32>;
 @group(0) @binding(4) var<storage, read> parameters: array<vec4f>;
-// Middles of the samples, [most samples, rays].
+// Middles of the samples, [most samples, rays of the march].
 @group(0) @binding(5) var<storage, read_write> middles: array<f32>;
 @group(0) @binding(6) var<storage, read_write> counts: array<u32>;
 
@@ -108,7 +108,7 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
         let cells = empty(u);
         if cells == 0.0 {
             if middle > ray.near && middle < ray.far {
-                middles[count * task.sizes.x + r] = middle;
+                middles[count * task.rows.w + r] = middle;
                 count++;
                 transmittance *= exp(-density_of(network(u)).x * step);
             }

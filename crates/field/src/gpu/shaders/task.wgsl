@@ -4,7 +4,7 @@ struct Task {
     sizes: vec4u,
     // Cells of the occupancy grid along a side; whether space is contracted; activation of the density; coefficients of the background.
     space: vec4u,
-    // Rows of the density, of the encoded direction and of the colour; unused.
+    // Rows of the density, of the encoded direction and of the colour; rays of the last march.
     rows: vec4u,
     // Shortest step; its fraction of the distance; bias of the density; unused.
     march: vec4f,

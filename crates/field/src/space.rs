@@ -4,6 +4,7 @@
 //! which [`Space::unit`] maps it. Distances along rays and densities are in field units.
 
 use crate::contraction::{contract, contract_vjp, uncontract};
+use crate::sample::aabb::intersect;
 use glam::{Mat3, Quat, Vec2, Vec3};
 use irradia_scene::Camera;
 use serde::{Deserialize, Serialize};
@@ -80,6 +81,9 @@ pub enum Measure {
 
 /// Length of contracted rays, field units: beyond it, points move by less than a cell of any grid.
 const MAX_RAY_LENGTH: f32 = 200.0;
+/// Distance from the axis of the frustum, in its half widths, up to which rays are followed. Cameras a little outside the capture see what
+/// is at its sides; a ray that turns away from the axis may have any length.
+const MAX_NDC_OFFSET: f32 = 8.0;
 
 impl Space {
     /// The cube about `center` with half size `half`, world units, and nothing outside.
@@ -186,7 +190,7 @@ impl Space {
         };
         match &self.outside {
             Outside::Nothing => {
-                if let Some([near, far]) = crate::sample::aabb::intersect(from, view, [-1.0; 3], [1.0; 3]) {
+                if let Some([near, far]) = intersect(from, view, [-1.0; 3], [1.0; 3]) {
                     (ray.near, ray.far) = (near, far);
                 }
             }
@@ -195,8 +199,12 @@ impl Space {
                 if let Some((from, along, [start, near])) = frustum.line(origin, view) {
                     let length = along.iter().map(|v| v * v).sum::<f32>().sqrt();
                     (ray.origin, ray.direction) = (from, along.map(|v| v / length));
-                    (ray.near, ray.far) = (0.0, length);
                     ray.measure = Measure::Ndc { start, near, length };
+                    let reach = MAX_NDC_OFFSET;
+                    let (low, high) = ([-reach, -reach, f32::NEG_INFINITY], [reach, reach, f32::INFINITY]);
+                    if let Some([near, far]) = intersect(from, ray.direction, low, high) {
+                        (ray.near, ray.far) = (near, far.min(length));
+                    }
                 }
             }
         }

@@ -83,6 +83,18 @@ fn with_normals() -> RenderOptions {
 }
 
 #[test]
+fn steps_advance_at_any_distance() {
+    let steps = Steps {
+        shortest: 0.005,
+        cone: 0.0,
+    };
+    assert_eq!(steps.at(1000.0), 0.005);
+    for t in [0.0f32, 1e5, 1e6, 1e20] {
+        assert!(t + steps.at(t) > t, "{t}");
+    }
+}
+
+#[test]
 fn uniform_fog_obeys_the_beer_lambert_law() {
     let field = uniform(0.3f32.ln(), |_| true);
     let view = render_view(&field, &camera(), &with_normals());

@@ -49,6 +49,31 @@ fn normalised_device_coordinates_keep_rays_straight_and_invert() {
 }
 
 #[test]
+fn rays_of_cameras_elsewhere_are_followed_near_the_frustum_only() {
+    let space = Space::ndc(&forward_facing(), 2.0).unwrap();
+    let mut hits = 0;
+    for (distance, degrees) in [(3.0f32, 60.0f32), (300.0, 90.0)] {
+        let pose = Pose {
+            position: Vec3::new(-5.0, 0.0, -distance),
+            rotation: Quat::from_rotation_y(degrees.to_radians()),
+        };
+        let camera = Camera::new(pose, Intrinsics::from_fov_x(64, 48, 0.9));
+        for i in 0..64 * 48 {
+            let (from, direction) = camera.ray(glam::Vec2::new((i % 64) as f32 + 0.5, (i / 64) as f32 + 0.5));
+            let ray = space.ray(from.to_array(), direction.to_array());
+            // 8 half widths to all sides, and the depth of the cube; distances of some thousand units have errors of 1e-3.
+            assert!(ray.far - ray.near < 23.0, "{ray:?}");
+            if ray.near < ray.far {
+                hits += 1;
+                let middle = ray.at(0.5 * (ray.near + ray.far));
+                assert!(middle.iter().all(|v| v.abs() < 8.01), "{middle:?}");
+            }
+        }
+    }
+    assert!(hits > 100, "{hits}");
+}
+
+#[test]
 fn ndc_gradients_match_finite_differences_in_the_world() {
     let space = Space::ndc(&forward_facing(), 2.0).unwrap();
     let (world, v) = ([0.3f32, -0.4, 5.0], [0.3f32, -0.7, 0.5]);

@@ -48,7 +48,7 @@ const SAMPLE_GROUP: usize = 256;
 const RAY_WORDS: usize = 20;
 const NEAR_WORD: usize = 3;
 const FAR_WORD: usize = 7;
-/// Maximum number of samples per ray: in normalised device coordinates, rays of cameras outside the capture may have any length.
+/// Maximum number of samples per ray: steps may be much shorter than the recipes'.
 const MAX_SAMPLES: usize = 1 << 14;
 
 /// The forward pass of a field.
@@ -122,7 +122,12 @@ impl GpuField {
         };
         let is_contracted = field.space.outside == Outside::Contracted;
         let coefficients = field.background.len() / 3;
-        let floats = [options.steps.shortest, options.steps.cone, net.shape.density_bias, 0.0];
+        let floats = [
+            options.steps.shortest,
+            options.steps.growth(),
+            net.shape.density_bias,
+            0.0,
+        ];
         let task_of_field = TaskOfField {
             space: [side as u32, u32::from(is_contracted), activation, coefficients as u32],
             rows: [layout.density_row, layout.direction_row, layout.rgb_row].map(|row| row as u32),
@@ -234,13 +239,13 @@ impl GpuField {
 
     /// Maximum number of steps along any ray of `batch`.
     pub fn max_samples(&self, batch: &Batch) -> usize {
-        let Steps { shortest, cone } = self.steps;
+        let (shortest, growth) = (self.steps.shortest, self.steps.growth());
         let spans = batch.rays.iter().map(|words| (words[NEAR_WORD], words[FAR_WORD]));
         let most = spans.fold(0.0f32, |most, (near, far)| {
             // Even steps up to here, then steps that grow with distance.
-            let even = if cone > 0.0 { (shortest / cone).max(near) } else { far };
+            let even = (shortest / growth).max(near);
             let growing = if even < far {
-                (far / even).ln() / cone.ln_1p()
+                (far / even).ln() / growth.ln_1p()
             } else {
                 0.0
             };

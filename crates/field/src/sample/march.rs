@@ -15,11 +15,20 @@ pub struct Steps {
     pub cone: f32,
 }
 
+/// Minimum step as a fraction of the distance: shorter ones would vanish in rounding, and a ray would not end.
+const MIN_CONE: f32 = 4.0 * f32::EPSILON;
+
 impl Steps {
     /// Step length at distance `t`.
     #[inline]
     pub fn at(&self, t: f32) -> f32 {
-        self.shortest.max(t * self.cone)
+        self.shortest.max(t * self.growth())
+    }
+
+    /// Step length as a fraction of the distance, where that exceeds [`Self::shortest`].
+    #[inline]
+    pub fn growth(&self) -> f32 {
+        self.cone.max(MIN_CONE)
     }
 
     /// Approximate step length at a point of field space, for cameras near the centre.
@@ -78,7 +87,7 @@ impl March<'_> {
             // Leaves the empty cells by whole steps, so that sample positions do not depend on what is skipped. In contracted
             // space rays are straight only in the inner cube.
             let inner = straight || p.iter().all(|v| v.abs() < 1.0);
-            if !inner || self.steps.cone > 0.0 && t * self.steps.cone > self.steps.shortest {
+            if !inner || step > self.steps.shortest {
                 t += step;
                 continue;
             }

@@ -53,7 +53,8 @@ pub fn densify(state: &mut SplatState, options: &ClassicOptions, rng: &mut Rng) 
     if options.revised_opacity {
         for (copy, i) in clone.iter().enumerate() {
             let opacity = state.splats.opacity(*i as usize);
-            let shared = logit((1.0 - (1.0 - opacity).sqrt()).max(1e-4));
+            // Below 1, where the logit is infinite.
+            let shared = logit((1.0 - (1.0 - opacity).sqrt()).clamp(1e-4, 1.0 - f32::EPSILON));
             clones.opacity_logits.set(0, copy, shared);
             state.splats.opacity_logits.set(0, *i as usize, shared);
         }
@@ -171,6 +172,10 @@ mod tests {
         assert_eq!(s.len(), 2);
         let through: f32 = (0..2).map(|i| 1.0 - s.splats.opacity(i)).product();
         assert!((through - 0.25).abs() < 1e-5, "{through}");
+
+        let mut opaque = state(&[(-5.0, 2.0, 400.0)]);
+        densify(&mut opaque, &options, &mut Rng::new(1, 1));
+        assert!((0..2).all(|i| opaque.splats.opacity_logits.get(0, i).is_finite()));
     }
 
     #[test]

@@ -79,6 +79,13 @@ fn pairs(blobs: &[Blob], max_pairs: usize) -> Vec<(u32, u32)> {
                 .map(move |other| (cost(&blobs[i], &blobs[other]), i.min(other) as u32, i.max(other) as u32))
         })
         .collect();
+    // Of many splats in one place, the tree finds the same few for all of them: each is paired with the next one, too.
+    let mut by_place: Vec<u32> = (0..blobs.len() as u32).collect();
+    by_place.par_sort_unstable_by_key(|i| (positions[*i as usize].map(f32::to_bits), *i));
+    candidates.par_extend(by_place.par_windows(2).filter_map(|pair| {
+        let (a, b) = (pair[0], pair[1]);
+        (positions[a as usize] == positions[b as usize]).then_some((0.0, a, b))
+    }));
     candidates.par_sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then((a.1, a.2).cmp(&(b.1, b.2))));
     let mut taken = vec![false; blobs.len()];
     let mut pairs = Vec::new();
@@ -108,8 +115,7 @@ const COLOR_SCALE: f32 = 0.1;
 fn unite(splats: &Splats, blobs: &[Blob], pairs: &[(u32, u32)]) -> Splats {
     let mut gone = vec![false; splats.len()];
     pairs.iter().for_each(|(_, b)| gone[*b as usize] = true);
-    let mut united = splats.gather(&[]);
-    united.clone_from(splats);
+    let mut united = splats.clone();
     let unions: Vec<(f32, Vec3, Quat, [f32; 3], f32)> = pairs
         .par_iter()
         .map(|(a, b)| union(&blobs[*a as usize], &blobs[*b as usize]))
@@ -181,6 +187,14 @@ mod tests {
         assert!(both.opacity(one) > 0.5, "{}", both.opacity(one));
         let spread = blob(&both, one).covariance.x_axis.x;
         assert!((spread - (0.01 + 0.01 * 2.0 / 9.0)).abs() < 1e-6, "{spread}");
+    }
+
+    #[test]
+    fn half_of_many_splats_in_one_place_are_merged_at_a_time() {
+        let mut splats = Splats::zeros(1000, 0);
+        (0..1000).for_each(|i| flat(&mut splats, i, Vec3::new(0.5, 0.25, 1.0), 0.5, 1.0));
+        let blobs: Vec<Blob> = (0..1000).map(|i| blob(&splats, i)).collect();
+        assert_eq!(pairs(&blobs, 1000).len(), 500);
     }
 
     #[test]

@@ -5,6 +5,7 @@ use crate::field::{Field, FieldError};
 use crate::net::NetParameters;
 use crate::space::Space;
 use crate::tensors::{Tensors, fill, named};
+use crate::train::MAX_RAYS;
 
 /// A field in training, with both moments of Adam.
 #[derive(Clone, Debug)]
@@ -52,7 +53,7 @@ impl FieldState {
         list
     }
 
-    /// Restores the state of [`Self::tensors`] after `step` steps, with `rays` in the next batch.
+    /// Restores the state of [`Self::tensors`] after `step` steps, with `rays` in the next batch, at most as many as a batch may have.
     ///
     /// # Errors
     /// As [`Field::from_tensors`].
@@ -68,7 +69,7 @@ impl FieldState {
             let lists = [&mut state.code_moments[k][..], &mut state.background_moments[k]];
             fill(prefix, &mut state.moments[k], lists, &mut get)?;
         }
-        (state.step, state.rays) = (step, rays);
+        (state.step, state.rays) = (step, rays.min(MAX_RAYS));
         Ok(state)
     }
 }

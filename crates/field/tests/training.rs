@@ -404,6 +404,13 @@ fn hostile_input_is_rejected_without_panics() {
     };
     assert_eq!(train_views(&mut state, &[view], &options()).rays, 0);
     assert!(before == bits(&state), "an empty batch changes nothing");
+    let tensors = state.tensors();
+    let get = |name: &str| Some(tensors.iter().find(|(n, ..)| n == name)?.2.to_vec());
+    let restored = FieldState::from_tensors(configs()[0].1.clone(), space, 0, usize::MAX, get).unwrap();
+    assert!(
+        restored.rays < 1 << 20,
+        "a damaged number of rays does not fill the memory"
+    );
     let rejected = |change: &dyn Fn(&mut FieldConfig)| {
         let mut config = FieldConfig::hash_grid();
         change(&mut config);

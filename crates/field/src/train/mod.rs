@@ -102,7 +102,8 @@ pub(crate) const EMPTY_CELL_DIVISOR: u32 = 16;
 /// follows the number of samples only gradually, and a new part of the scene may yield many more.
 const MAX_EXCESS: usize = 4;
 /// Bounds of the number of rays in a batch.
-const RAY_BOUNDS: [usize; 2] = [64, 16_384];
+const MIN_RAYS: usize = 64;
+pub(crate) const MAX_RAYS: usize = 16_384;
 /// One in this many rays passes through a pixel of known depth if the depth loss is on.
 const KNOWN_DEPTH_DIVISOR: usize = 4;
 
@@ -148,7 +149,7 @@ pub(crate) fn max_samples(options: &StepOptions) -> usize {
 /// Sets the number of rays of the next batch.
 pub(crate) fn set_rays(state: &mut FieldState, loss: &StepLoss, options: &StepOptions) {
     let wanted = options.samples as f64 * loss.rays as f64 / loss.samples.max(1) as f64;
-    state.rays = ((0.8 * state.rays as f64 + 0.2 * wanted) as usize).clamp(RAY_BOUNDS[0], RAY_BOUNDS[1]);
+    state.rays = ((0.8 * state.rays as f64 + 0.2 * wanted) as usize).clamp(MIN_RAYS, MAX_RAYS);
 }
 
 /// Takes one step on `batch`.

@@ -200,8 +200,8 @@ impl Space {
                     let length = along.iter().map(|v| v * v).sum::<f32>().sqrt();
                     (ray.origin, ray.direction) = (from, along.map(|v| v / length));
                     ray.measure = Measure::Ndc { start, near, length };
-                    let reach = MAX_NDC_OFFSET;
-                    let (low, high) = ([-reach, -reach, f32::NEG_INFINITY], [reach, reach, f32::INFINITY]);
+                    // All of the line lies between -1 and 1 in depth.
+                    let (low, high) = ([-MAX_NDC_OFFSET; 3], [MAX_NDC_OFFSET; 3]);
                     if let Some([near, far]) = intersect(from, ray.direction, low, high) {
                         (ray.near, ray.far) = (near, far.min(length));
                     }

@@ -74,6 +74,17 @@ fn rays_of_cameras_elsewhere_are_followed_near_the_frustum_only() {
 }
 
 #[test]
+fn rays_that_are_not_finite_miss() {
+    let ndc = Space::ndc(&forward_facing(), 2.0).unwrap();
+    for space in [Space::cube([0.0; 3], 1.0), ndc] {
+        for (origin, view) in [([f32::NAN; 3], [0.0, 0.0, 1.0]), ([0.0; 3], [f32::NAN; 3])] {
+            let ray = space.ray(origin, view);
+            assert!(ray.near >= ray.far, "{ray:?}");
+        }
+    }
+}
+
+#[test]
 fn ndc_gradients_match_finite_differences_in_the_world() {
     let space = Space::ndc(&forward_facing(), 2.0).unwrap();
     let (world, v) = ([0.3f32, -0.4, 5.0], [0.3f32, -0.7, 0.5]);

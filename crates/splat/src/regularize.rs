@@ -210,9 +210,10 @@ fn for_each_size(log_scales: &mut Planes, change: impl Fn(usize, [&mut f32; 3]) 
         });
 }
 
-/// How large a splat may be, as seen from a camera. A footprint is the affine approximation of a splat's projection at its centre. Of a large
-/// splat beside the camera, at a depth `Z` near 0, that approximation has a standard deviation of `s f / Z` at a distance of `X f / Z` from
-/// the image, whatever `Z` is: above `s / X` = 0.3 it covers the image as a veil, although the splat itself does not enter the view.
+/// How large a splat may be, as seen from a camera. A footprint is the affine approximation of a splat's projection at its centre. Of a
+/// large splat beside the camera, at a depth `Z` near 0, that approximation has a standard deviation of `s f / Z` at a distance of
+/// `X f / Z` from the image, whatever `Z` is: above `s / X` = 0.3 it covers the image as a veil, although the splat itself does not enter
+/// the view.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AngleCap {
     /// Position of the camera, world.
@@ -221,10 +222,10 @@ pub struct AngleCap {
     pub largest: f32,
 }
 
-/// The highest [`AngleCap::largest`] for photographs of wide lenses that are not cut into faces. The approximations of a footprint for a lens
-/// and for a pinhole differ where the splat is large: renders through a fisheye then look right, and those through a pinhole show veils.
-/// `synth`'s room by a fisheye of 190 degrees, held-out views by a pinhole, 1,500 steps: 32.3 dB without a cap, 36.2, 37.3 and 38.0 with
-/// 0.25, 0.15 and 0.1; antialiased 39.3 with 0.1, 39.7 with 0.05.
+/// The highest [`AngleCap::largest`] for photographs of wide lenses that are not cut into faces. The approximations of a footprint for a
+/// lens and for a pinhole differ where the splat is large: renders through a fisheye then look right, and those through a pinhole show
+/// veils. `synth`'s room by a fisheye of 190 degrees, held-out views by a pinhole, 1,500 steps: 32.3 dB without a cap, 36.2, 37.3 and 38.0
+/// with 0.25, 0.15 and 0.1; antialiased 39.3 with 0.1, 39.7 with 0.05.
 const MAX_WIDE_LENS_RATIO: f32 = 0.1;
 
 impl AngleCap {

@@ -136,8 +136,8 @@ impl SplatState {
     }
 
     /// Keeps the splats `kept`, adds `added` with moments of zero, resets the moments of the splats `reset` (ascending), clears the
-    /// statistics of all but those that `keeps_statistics` accepts, and puts all into Morton order: a round of density control in one pass over the state, column by column, so that
-    /// it needs hardly more memory than the state itself.
+    /// statistics of all but those that `keeps_statistics` accepts, and puts all into Morton order: a round of density control in one pass
+    /// over the state, column by column, so that it needs hardly more memory than the state itself.
     pub fn rebuild(
         &mut self,
         kept: Vec<u32>,

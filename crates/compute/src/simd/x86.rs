@@ -78,7 +78,8 @@ macro_rules! float_lanes {
      abs: |$abs_v:ident| $abs:expr, neg: |$neg_v:ident| $neg:expr, floor: |$floor_v:ident| $floor:expr,
      lt: |$lt_a:ident, $lt_b:ident| $lt:expr, le: |$le_a:ident, $le_b:ident| $le:expr,
      select: |$sel_m:ident, $sel_a:ident, $sel_b:ident| $select:expr,
-     exp2: |$exp_v:ident| $exp2:expr, recip: |$recip_v:ident| $recip:expr, sum: |$sum_v:ident| $sum:expr, sums: $sums:ident, transpose: $transpose:ident) => {
+     exp2: |$exp_v:ident| $exp2:expr, recip: |$recip_v:ident| $recip:expr, sum: |$sum_v:ident| $sum:expr, sums: $sums:ident,
+     transpose: $transpose:ident) => {
         impl Simd for $simd {
             type F = $vector;
             const LANES: usize = $lanes;

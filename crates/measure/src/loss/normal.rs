@@ -41,8 +41,8 @@ impl Default for NormalLoss {
 }
 
 impl NormalLoss {
-    /// The loss of `frame`, which `camera` sees; `weight` times its gradient is added to `gradient`. The four depths of a sample are `reach`
-    /// pixels from it; samples whose pixels are not all in the image do not count.
+    /// The loss of `frame`, which `camera` sees; `weight` times its gradient is added to `gradient`. The four depths of a sample are
+    /// `reach` pixels from it; samples whose pixels are not all in the image do not count.
     ///
     /// # Panics
     /// When the lengths differ: a bug in the caller.

@@ -4,9 +4,9 @@ use irradia_compute::simd::Simd;
 use irradia_compute::unroll;
 use irradia_scene::Camera;
 
-/// Splats centred farther outside the image than this many of its longer sides are not drawn. The affine approximation of their footprint is
-/// wrong by then: that of a large splat beside the camera covers the image, although the splat does not enter the view. No splat that the
-/// golden images show is farther outside than 1.3 sides; other viewers draw the line at 0.1 to 0.2 (antimatter15's splat, Spark).
+/// Splats centred farther outside the image than this many of its longer sides are not drawn. The affine approximation of their footprint
+/// is wrong by then: that of a large splat beside the camera covers the image, although the splat does not enter the view. No splat that
+/// the golden images show is farther outside than 1.3 sides; other viewers draw the line at 0.1 to 0.2 (antimatter15's splat, Spark).
 const MAX_SIDES_OUTSIDE: f64 = 2.0;
 
 /// A camera as the renderer uses it, in double precision for the tests.

@@ -114,7 +114,8 @@ fn main(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
             let a = footprints[3u * i];
             let c = footprints[3u * i + 2u];
             let y = a.y - origin.y;
-            held[lane] = Held(vec4f(a.x - origin.x, y, a.zw), footprints[3u * i + 1u], vec4f(c.xy, y - c.w - ROW_SLACK, y + c.w + ROW_SLACK));
+            let rows = vec2f(y - c.w - ROW_SLACK, y + c.w + ROW_SLACK);
+            held[lane] = Held(vec4f(a.x - origin.x, y, a.zw), footprints[3u * i + 1u], vec4f(c.xy, rows));
             held_slots[lane] = slot;
         }
         workgroupBarrier();

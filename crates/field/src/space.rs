@@ -177,7 +177,7 @@ impl Space {
         })
     }
 
-    /// The ray from a world point along a unit direction.
+    /// The ray from a world point along a unit direction; it misses if one of them is not finite.
     pub fn ray(&self, origin: [f32; 3], view: [f32; 3]) -> Ray {
         let from: [f32; 3] = std::array::from_fn(|c| (origin[c] - self.center[c]) * self.scale);
         let mut ray = Ray {
@@ -188,6 +188,9 @@ impl Space {
             far: 0.0,
             measure: Measure::Linear(1.0 / self.scale),
         };
+        if !from.iter().chain(&view).all(|v| v.is_finite()) {
+            return ray;
+        }
         match &self.outside {
             Outside::Nothing => {
                 if let Some([near, far]) = intersect(from, view, [-1.0; 3], [1.0; 3]) {

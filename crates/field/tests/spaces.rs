@@ -76,7 +76,7 @@ fn rays_of_cameras_elsewhere_are_followed_near_the_frustum_only() {
 #[test]
 fn rays_that_are_not_finite_miss() {
     let ndc = Space::ndc(&forward_facing(), 2.0).unwrap();
-    for space in [Space::cube([0.0; 3], 1.0), ndc] {
+    for space in [Space::cube([0.0; 3], 1.0), Space::contracted([0.0; 3], 1.0), ndc] {
         for (origin, view) in [([f32::NAN; 3], [0.0, 0.0, 1.0]), ([0.0; 3], [f32::NAN; 3])] {
             let ray = space.ray(origin, view);
             assert!(ray.near >= ray.far, "{ray:?}");

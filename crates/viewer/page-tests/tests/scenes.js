@@ -13,10 +13,10 @@ export function dataset() {
   return data;
 }
 
-/** A run on it. */
+/** A run on it, over black as a splat file without a run is shown. */
 export function trained() {
   const out = join(scratch, "run");
-  if (!existsSync(out)) run("train", dataset(), "--out", out, "--steps", "400");
+  if (!existsSync(out)) run("train", dataset(), "--out", out, "--steps", "400", "--background", "black");
   return out;
 }
 

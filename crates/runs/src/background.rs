@@ -206,9 +206,9 @@ impl Background {
     /// The default for a dataset:
     ///
     /// - white for Blender scenes with transparent photographs, judged by the first one;
-    /// - white for photographs without alpha of objects cut out on white, judged by about eight of them;
-    /// - the colour of the backdrop if photographs without alpha have one around their object, or at the rim of their masks;
-    /// - grey for others without alpha if the recipe wants surfaces to cover it (`covers`);
+    /// - white for opaque photographs of objects cut out on white, judged by about eight of them;
+    /// - the colour of the backdrop if opaque photographs have one around their object, or at the rim of their masks;
+    /// - grey for other opaque photographs if the recipe wants surfaces to cover it (`covers`);
     /// - otherwise the recipe's own (`None`).
     ///
     /// # Errors

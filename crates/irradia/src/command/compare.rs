@@ -72,8 +72,8 @@ pub struct Args {
     #[arg(long, value_name = "PATH")]
     pub lpips: Option<PathBuf>,
     /// Background of the scene: white, black, grey, a colour such as '#c8c0b4', or random (random colours in training, white in
-    /// evaluation); when absent white for Blender scenes and objects cut out on white, the colour of a white or black backdrop, else that
-    /// of the recipe
+    /// evaluation); when absent white for transparent Blender scenes and objects cut out on white, the colour of a white or black
+    /// backdrop, else that of the recipe
     #[arg(long, value_name = "COLOR")]
     pub background: Option<Background>,
     /// Read and score the datasets as the papers do, and show their figures: blender, llff, mipnerf360 or tandt; the folder of a dataset

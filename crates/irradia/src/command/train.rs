@@ -94,8 +94,8 @@ pub struct Args {
     #[arg(long, value_name = "PATH")]
     pub lpips: Option<PathBuf>,
     /// Background of the scene: white, black, grey, a colour such as '#c8c0b4', or random (random colours in training, white in
-    /// evaluation); when absent white for Blender scenes and objects cut out on white, the colour of a white or black backdrop, else that
-    /// of the recipe
+    /// evaluation); when absent white for transparent Blender scenes and objects cut out on white, the colour of a white or black
+    /// backdrop, else that of the recipe
     #[arg(long, value_name = "COLOR", conflicts_with = "resume")]
     pub background: Option<Background>,
     /// Serve a page to watch and pause the training; see irradia view

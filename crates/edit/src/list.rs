@@ -402,14 +402,16 @@ fn from_tagged<T: DeserializeOwned>(table: impl Into<toml::Value>, tag: &str) ->
     let table = table.into();
     let name = table.get(tag).and_then(toml::Value::as_str).unwrap_or(tag).to_owned();
     table.try_into().map_err(|error: toml::de::Error| {
-        let message = error.message().replace('\n', " ");
-        let message = ["usize", "u32"].iter().fold(message, |message, whole| {
-            message.replace(&format!("expected {whole}"), "expected a whole number")
+        let words = [
+            ("\n", " "),
+            ("expected usize", "expected a whole number"),
+            ("expected u32", "expected a whole number"),
+            ("expected f64", "expected a number"),
+        ];
+        let message = words.iter().fold(error.message().to_owned(), |message, (from, to)| {
+            message.replace(from, to)
         });
-        EditError::Syntax(format!(
-            "{name}: {}",
-            message.replace("expected f64", "expected a number")
-        ))
+        EditError::Syntax(format!("{name}: {message}"))
     })
 }
 

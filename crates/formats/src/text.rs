@@ -1,3 +1,5 @@
+//! Texts in the encodings of lists and tables.
+
 use std::borrow::Cow;
 
 /// The characters of the bytes 0x80 to 0x9f in Windows-1252; the others are those of Unicode.

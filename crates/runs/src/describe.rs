@@ -16,8 +16,8 @@ use std::path::Path;
 /// something that is not a dataset.
 pub fn describe(path: impl AsRef<Path>, reading: &ReadingOptions) -> Result<Description, RunError> {
     let scene = scene_path(path.as_ref());
-    let is_scene = is_field(&scene) || matches!(detect(&scene), Ok(Kind::Splats(_) | Kind::Points));
-    if is_scene && *reading != ReadingOptions::default() {
+    let is_scene = || is_field(&scene) || matches!(detect(&scene), Ok(Kind::Splats(_) | Kind::Points));
+    if *reading != ReadingOptions::default() && is_scene() {
         let message = format!("{} is not a dataset: omit the options for reading one", scene.display());
         return Err(RunError::Refused(message));
     }

@@ -37,6 +37,14 @@ pub enum Lens {
 }
 
 impl Lens {
+    /// Radial coefficients k1..k3 and tangential ones p1, p2 (Brown and Conrady).
+    pub const fn brown([k1, k2, k3]: [f64; 3], p: [f64; 2]) -> Self {
+        Lens::Opencv {
+            k: [k1, k2, k3, 0.0, 0.0, 0.0],
+            p,
+        }
+    }
+
     /// A fisheye without tangential distortion or prism.
     pub const fn fisheye(k: [f64; 4]) -> Self {
         Lens::Fisheye {

@@ -87,15 +87,15 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
         return Err(FormatError::malformed(&list, message));
     }
     let root = list.parent().unwrap_or(Path::new(".")).to_owned();
-    let (points, points_seen) = declared_points(&bundle.points, names.len());
+    let (points, mut points_seen) = declared_points(bundle.points);
     let mut views = Vec::with_capacity(names.len());
     // A focal length of 0 says that the photograph has no pose.
-    let entries = names.iter().zip(&bundle.cameras).zip(points_seen);
-    for ((name, camera), points_seen) in entries.filter(|((_, camera), _)| camera.focal != 0.0) {
+    let entries = names.iter().zip(&bundle.cameras).enumerate();
+    for (i, (name, camera)) in entries.filter(|(_, (_, camera))| camera.focal != 0.0) {
         let name = name.replace('\\', "/");
         let image = locate_image(&root, &IMAGE_FOLDERS, &name);
         views.push(DeclaredView {
-            points_seen,
+            points_seen: points_seen.remove(&i).unwrap_or_default(),
             ..DeclaredView::posed(&root, &name, image, pose(camera), declared_camera(camera))
         });
     }
@@ -150,9 +150,6 @@ fn declared_camera(camera: &BundleCamera) -> DeclaredCamera {
         size: None,
         focal: Focal::Pixels([camera.focal; 2]),
         center: None,
-        lens: lens_or_pinhole(Lens::Opencv {
-            k: [camera.k[0], camera.k[1], 0.0, 0.0, 0.0, 0.0],
-            p: [0.0; 2],
-        }),
+        lens: lens_or_pinhole(Lens::brown([camera.k[0], camera.k[1], 0.0], [0.0; 2])),
     }
 }

@@ -2,10 +2,10 @@
 //! column by column, and the camera's centre. Focal lengths are in pixels, or in mm on a sensor (from version 1.2.2); the principal point
 //! is counted from the corner, or from the centre (from version 1.2.1). As in `jsonIO.cpp` of AliceVision, by which it reads its files.
 
-use super::declared::{
-    DeclaredCamera, DeclaredDataset, DeclaredPoints, DeclaredPose, DeclaredView, Focal, lens_or_pinhole, pose_from_axes,
-};
+use super::declared::{DeclaredCamera, DeclaredDataset, DeclaredPose, Focal, lens_or_pinhole, pose_from_axes};
 use super::files::{first_file, locate_image};
+use super::linked::{Linked, LinkedView};
+use super::tracks::declared_points;
 use crate::error::read_and_parse;
 use crate::{FormatError, Malformed};
 use glam::DVec3;
@@ -161,50 +161,11 @@ pub(super) fn find(path: &Path) -> Option<PathBuf> {
 
 pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, FormatError> {
     let file = find(path).ok_or_else(|| FormatError::malformed(path, "contains no .sfm file with poses"))?;
-    let data = read_and_parse(&file, parse_meshroom)?;
-    let root = file.parent().unwrap_or(Path::new(".")).to_owned();
-    let mut cameras = HashMap::new();
-    for intrinsics in &data.intrinsics {
-        let camera = intrinsics
-            .camera(data.version())
-            .map_err(|source| FormatError::Malformed {
-                path: file.clone(),
-                source,
-            })?;
-        cameras.insert(&intrinsics.intrinsic_id, camera);
-    }
-    let poses: HashMap<&Id, &Transform> = data
-        .poses
-        .iter()
-        .map(|entry| (&entry.pose_id, &entry.pose.transform))
-        .collect();
-    let (points, mut points_seen) = data.points();
-    let mut views = Vec::new();
-    for view in data.views.iter().filter(|view| view.rig_id.is_none()) {
-        let pose = view.pose_id.as_ref().and_then(|id| poses.get(id));
-        let camera = view.intrinsic_id.as_ref().and_then(|id| cameras.get(id));
-        let (Some(pose), Some(camera)) = (pose, camera) else {
-            continue;
-        };
-        let name = view.path.replace('\\', "/");
-        let image = locate_image(&root, &IMAGE_FOLDERS, &name);
-        views.push(DeclaredView {
-            points_seen: points_seen.remove(&view.view_id).unwrap_or_default(),
-            ..DeclaredView::posed(&root, &name, image, pose.pose(), *camera)
-        });
-    }
-    let unposed = data.views.len() - views.len();
-    let warning =
-        (unposed > 0).then(|| format!("{unposed} photographs have no pose, or one relative to a rig, and are skipped"));
-    Ok(DeclaredDataset {
-        kind: "Meshroom",
-        root,
-        views,
-        points: Some(points),
-        ignores_exif: true,
-        downscale,
-        warnings: warning.into_iter().collect(),
-    })
+    let linked = read_and_parse(&file, |bytes| parse_meshroom(bytes)?.linked())?;
+    let root = file.parent().unwrap_or(Path::new("."));
+    let locate = |name: &str| locate_image(root, &IMAGE_FOLDERS, name);
+    let lack = "no pose, or one relative to a rig,";
+    Ok(linked.dataset("Meshroom", root, downscale, lack, &locate))
 }
 
 /// Parses an `.sfm` file.
@@ -220,21 +181,36 @@ impl SfmFile {
         self.version.array().unwrap_or_default().map(|part: f64| part as u32)
     }
 
-    /// The usable points, and the indices of those that each view sees.
-    fn points(&self) -> (DeclaredPoints, HashMap<&Id, Vec<u32>>) {
-        let mut points = DeclaredPoints::default();
-        let mut seen: HashMap<&Id, Vec<u32>> = HashMap::new();
-        for landmark in &self.structure {
-            let index = points.positions.len() as u32;
+    fn linked(self) -> Result<Linked<Id>, Malformed> {
+        let version = self.version();
+        let mut cameras = HashMap::new();
+        for intrinsics in self.intrinsics {
+            let camera = intrinsics.camera(version)?;
+            cameras.insert(intrinsics.intrinsic_id, camera);
+        }
+        let poses = self.poses.into_iter();
+        let views = self.views.into_iter().map(|view| LinkedView {
+            key: view.view_id,
+            pose: view.pose_id.filter(|_| view.rig_id.is_none()),
+            camera: view.intrinsic_id,
+            name: view.path.replace('\\', "/"),
+        });
+        let tracks = self.structure.into_iter().map(|landmark| {
             let position = landmark.position.array().unwrap_or([f64::NAN; 3]);
             let color = landmark.color.array().unwrap_or([128.0; 3]);
-            if points.push(position.into(), color.map(|value| value as u8)) {
-                for view in &landmark.observations {
-                    seen.entry(&view.observation_id).or_default().push(index);
-                }
-            }
-        }
-        (points, seen)
+            let views = landmark.observations.into_iter().map(|view| view.observation_id);
+            (position, color.map(|value| value as u8), views.collect())
+        });
+        let (points, points_seen) = declared_points(tracks);
+        Ok(Linked {
+            views: views.collect(),
+            poses: poses
+                .map(|entry| (entry.pose_id, entry.pose.transform.pose()))
+                .collect(),
+            cameras,
+            points,
+            points_seen,
+        })
     }
 }
 
@@ -282,19 +258,15 @@ impl Intrinsics {
     }
 
     fn lens(&self) -> Result<Lens, Malformed> {
-        let opencv = |[k1, k2, k3]: [f64; 3], p: [f64; 2]| Lens::Opencv {
-            k: [k1, k2, k3, 0.0, 0.0, 0.0],
-            p,
-        };
         let distortion = match (self.kind.as_str(), self.distortion_type.as_deref()) {
             ("pinhole", distortion) => distortion.unwrap_or("none"),
             (kind, _) => kind,
         };
         Ok(match (distortion, &self.distortion_params.0[..]) {
             ("none" | "pinhole", _) => Lens::Pinhole,
-            ("radial1" | "radialk1", &[k1]) => opencv([k1, 0.0, 0.0], [0.0; 2]),
-            ("radial3" | "radialk3", &[k1, k2, k3]) => opencv([k1, k2, k3], [0.0; 2]),
-            ("brown", &[k1, k2, k3, p1, p2]) => opencv([k1, k2, k3], [p1, p2]),
+            ("radial1" | "radialk1", &[k1]) => Lens::brown([k1, 0.0, 0.0], [0.0; 2]),
+            ("radial3" | "radialk3", &[k1, k2, k3]) => Lens::brown([k1, k2, k3], [0.0; 2]),
+            ("brown", &[k1, k2, k3, p1, p2]) => Lens::brown([k1, k2, k3], [p1, p2]),
             ("fisheye4" | "fisheye", &[k1, k2, k3, k4]) => Lens::fisheye([k1, k2, k3, k4]),
             (other, parameters) => {
                 return Err(Malformed(format!(

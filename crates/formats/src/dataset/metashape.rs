@@ -184,10 +184,7 @@ fn intrinsics(sensor: &Element, calibration: &Element) -> Result<(DeclaredCamera
         .unwrap_or("frame");
     let p = [coefficient("p2"), coefficient("p1")];
     let lens = match kind {
-        "frame" if coefficient("k4") == 0.0 => Lens::Opencv {
-            k: [coefficient("k1"), coefficient("k2"), coefficient("k3"), 0.0, 0.0, 0.0],
-            p,
-        },
+        "frame" if coefficient("k4") == 0.0 => Lens::brown(["k1", "k2", "k3"].map(coefficient), p),
         "frame" => {
             return Err(Malformed(
                 "a sensor has a k4, which is not supported; optimise the cameras without it, or undistort the photographs".into(),

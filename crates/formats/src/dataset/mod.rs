@@ -10,6 +10,7 @@ pub(crate) mod colmap;
 mod declared;
 mod files;
 mod images;
+mod linked;
 pub(crate) mod llff;
 pub(crate) mod meshroom;
 pub(crate) mod metashape;

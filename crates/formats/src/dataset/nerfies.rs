@@ -163,15 +163,11 @@ impl NerfiesCamera {
     }
 
     fn intrinsics(&self) -> DeclaredCamera {
-        let [k1, k2, k3] = self.radial_distortion;
         DeclaredCamera {
             size: Some(self.image_size).filter(|[w, h]| *w >= 1.0 && *h >= 1.0),
             focal: Focal::Pixels([self.focal_length, self.focal_length * self.pixel_aspect_ratio]),
             center: Some(self.principal_point),
-            lens: lens_or_pinhole(Lens::Opencv {
-                k: [k1, k2, k3, 0.0, 0.0, 0.0],
-                p: self.tangential_distortion,
-            }),
+            lens: lens_or_pinhole(Lens::brown(self.radial_distortion, self.tangential_distortion)),
         }
     }
 }

@@ -63,12 +63,12 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
         let n = model.images.len();
         warnings.push(format!("the largest of {count} models is used, with {n} photographs"));
     }
-    let (points, seen) = declared_points(&model.points, model.images.len());
-    let views = model.images.iter().zip(seen).map(|(image, points_seen)| {
+    let (points, mut points_seen) = declared_points(model.points);
+    let views = model.images.iter().enumerate().map(|(i, image)| {
         let name = image.name.replace('\\', "/");
         let image_path = locate_image(&root, &IMAGE_FOLDERS, &name);
         DeclaredView {
-            points_seen,
+            points_seen: points_seen.remove(&i).unwrap_or_default(),
             ..DeclaredView::posed(&root, &name, image_path, pose(image), declared_camera(image))
         }
     });
@@ -171,10 +171,7 @@ fn declared_camera(image: &NvmImage) -> DeclaredCamera {
         size: None,
         focal: Focal::Pixels(image.focal),
         center: image.principal,
-        lens: lens_or_pinhole(Lens::Opencv {
-            k: [-r, 3.0 * r * r, -12.0 * r * r * r, 0.0, 0.0, 0.0],
-            p: [0.0; 2],
-        }),
+        lens: lens_or_pinhole(Lens::brown([-r, 3.0 * r * r, -12.0 * r * r * r], [0.0; 2])),
     }
 }
 

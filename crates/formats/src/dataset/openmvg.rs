@@ -1,15 +1,14 @@
 //! `sfm_data.json` of OpenMVG (<https://openmvg.readthedocs.io/en/latest/openMVG/sfm/sfm/>). Poses are a camera-from-world rotation, row
 //! by row, and the camera's centre. Points have no colours.
 
-use super::declared::{
-    DeclaredCamera, DeclaredDataset, DeclaredPoints, DeclaredPose, DeclaredView, Focal, lens_or_pinhole, pose_from_axes,
-};
+use super::declared::{DeclaredCamera, DeclaredDataset, DeclaredPose, Focal, lens_or_pinhole, pose_from_axes};
 use super::files::{file_named, find_image, locate_image};
+use super::linked::{Linked, LinkedView};
+use super::tracks::declared_points;
 use crate::error::read_and_parse;
 use crate::{FormatError, Malformed};
 use irradia_scene::Lens;
 use serde::Deserialize;
-use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 /// Where OpenMVG's scripts write it.
@@ -117,46 +116,13 @@ pub(super) fn find(path: &Path) -> Option<PathBuf> {
 
 pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, FormatError> {
     let file = find(path).ok_or_else(|| FormatError::malformed(path, "contains no sfm_data.json"))?;
-    let data = read_and_parse(&file, parse_openmvg)?;
-    let root = file.parent().unwrap_or(Path::new(".")).to_owned();
-    if data.extrinsics.is_empty() {
-        let message = "has no poses; name the sfm_data.json of the reconstruction, or convert its sfm_data.bin to it";
-        return Err(FormatError::malformed(&file, message));
-    }
-    let malformed = |source| FormatError::Malformed {
-        path: file.clone(),
-        source,
+    let (photographs, linked) = read_and_parse(&file, |bytes| parse_openmvg(bytes)?.linked())?;
+    let root = file.parent().unwrap_or(Path::new("."));
+    let locate = |name: &str| {
+        let image = find_image(&photographs.join(name));
+        image.or_else(|| locate_image(root, &IMAGE_FOLDERS, name))
     };
-    let mut cameras = HashMap::new();
-    for Entry { key, value } in &data.intrinsics {
-        cameras.insert(*key, value.ptr_wrapper.data.camera().map_err(malformed)?);
-    }
-    let poses: HashMap<u32, &Pose> = data.extrinsics.iter().map(|entry| (entry.key, &entry.value)).collect();
-    let (points, mut points_seen) = data.points();
-    let mut views = Vec::new();
-    for view in data.views.iter().map(|entry| &entry.value.ptr_wrapper.data) {
-        let (Some(pose), Some(camera)) = (poses.get(&view.id_pose), cameras.get(&view.id_intrinsic)) else {
-            continue;
-        };
-        let name = view.name();
-        let image = find_image(&Path::new(&data.root_path).join(&name));
-        let image = image.or_else(|| locate_image(&root, &IMAGE_FOLDERS, &name));
-        views.push(DeclaredView {
-            points_seen: points_seen.remove(&view.id_view).unwrap_or_default(),
-            ..DeclaredView::posed(&root, &name, image, pose.declared(), *camera)
-        });
-    }
-    let unposed = data.views.len() - views.len();
-    let warning = (unposed > 0).then(|| format!("{unposed} photographs have no pose or no camera and are skipped"));
-    Ok(DeclaredDataset {
-        kind: "OpenMVG",
-        root,
-        views,
-        points: Some(points),
-        ignores_exif: true,
-        downscale,
-        warnings: warning.into_iter().collect(),
-    })
+    Ok(linked.dataset("OpenMVG", root, downscale, "no pose or no camera", &locate))
 }
 
 /// Parses an `sfm_data.json`.
@@ -168,19 +134,44 @@ pub fn parse_openmvg(bytes: &[u8]) -> Result<SfmData, Malformed> {
 }
 
 impl SfmData {
-    /// The usable points, and the indices of those that each view sees.
-    fn points(&self) -> (DeclaredPoints, HashMap<u32, Vec<u32>>) {
-        let mut points = DeclaredPoints::default();
-        let mut seen: HashMap<u32, Vec<u32>> = HashMap::new();
-        for Entry { value: landmark, .. } in &self.structure {
-            let index = points.positions.len() as u32;
-            if points.push(landmark.position.into(), POINT_COLOR) {
-                for view in &landmark.observations {
-                    seen.entry(view.key).or_default().push(index);
-                }
-            }
+    /// The folder of the photographs, and the reconstruction.
+    fn linked(self) -> Result<(PathBuf, Linked<u32>), Malformed> {
+        if self.extrinsics.is_empty() {
+            let message =
+                "has no poses; name the sfm_data.json of the reconstruction, or convert its sfm_data.bin to it";
+            return Err(Malformed(message.into()));
         }
-        (points, seen)
+        let cameras = self.intrinsics.iter().map(|entry| {
+            let camera = entry.value.ptr_wrapper.data.camera()?;
+            Ok((entry.key, camera))
+        });
+        let cameras = cameras.collect::<Result<_, Malformed>>()?;
+        let views = self.views.iter().map(|entry| {
+            let view = &entry.value.ptr_wrapper.data;
+            LinkedView {
+                key: view.id_view,
+                pose: Some(view.id_pose),
+                camera: Some(view.id_intrinsic),
+                name: view.name(),
+            }
+        });
+        let tracks = self.structure.into_iter().map(|entry| {
+            let views = entry.value.observations.iter().map(|view| view.key).collect();
+            (entry.value.position, POINT_COLOR, views)
+        });
+        let (points, points_seen) = declared_points(tracks);
+        let linked = Linked {
+            views: views.collect(),
+            poses: self
+                .extrinsics
+                .iter()
+                .map(|entry| (entry.key, entry.value.declared()))
+                .collect(),
+            cameras,
+            points,
+            points_seen,
+        };
+        Ok((self.root_path.into(), linked))
     }
 }
 
@@ -208,14 +199,10 @@ impl Intrinsics {
         let Some(focal) = self.get(|own| own.focal_length) else {
             return Ok(DeclaredCamera::panorama());
         };
-        let opencv = |[k1, k2, k3]: [f64; 3], p: [f64; 2]| Lens::Opencv {
-            k: [k1, k2, k3, 0.0, 0.0, 0.0],
-            p,
-        };
         let lens = match (self.disto_k1, self.disto_k3, self.disto_t2, self.fisheye) {
-            (Some([k1]), ..) => opencv([k1, 0.0, 0.0], [0.0; 2]),
-            (_, Some(k), ..) => opencv(k, [0.0; 2]),
-            (_, _, Some([k1, k2, k3, p1, p2]), _) => opencv([k1, k2, k3], [p1, p2]),
+            (Some([k1]), ..) => Lens::brown([k1, 0.0, 0.0], [0.0; 2]),
+            (_, Some(k), ..) => Lens::brown(k, [0.0; 2]),
+            (_, _, Some([k1, k2, k3, p1, p2]), _) => Lens::brown([k1, k2, k3], [p1, p2]),
             (_, _, _, Some(k)) => Lens::fisheye(k),
             _ => Lens::Pinhole,
         };

@@ -161,14 +161,8 @@ fn declared_camera(camera: &Camera) -> Result<DeclaredCamera, Malformed> {
         k1, k2, k3, k4, p1, p2, ..
     } = *camera;
     let lens = match camera.projection_type.as_str() {
-        "perspective" | "simple_radial" | "radial" => Lens::Opencv {
-            k: [k1, k2, 0.0, 0.0, 0.0, 0.0],
-            p: [0.0; 2],
-        },
-        "brown" => Lens::Opencv {
-            k: [k1, k2, k3, 0.0, 0.0, 0.0],
-            p: [p1, p2],
-        },
+        "perspective" | "simple_radial" | "radial" => Lens::brown([k1, k2, 0.0], [0.0; 2]),
+        "brown" => Lens::brown([k1, k2, k3], [p1, p2]),
         "fisheye" | "fisheye_opencv" => Lens::fisheye([k1, k2, k3, k4]),
         other => {
             return Err(Malformed(format!(

@@ -123,10 +123,7 @@ fn view(root: &Path, image: Option<PathBuf>, row: RealityCaptureView) -> Declare
         size: Some(size),
         focal: Focal::Pixels([row.focal * longer_side; 2]),
         center: Some([0, 1].map(|i| 0.5 * size[i] + row.offset[i] * longer_side)),
-        lens: lens_or_pinhole(Lens::Opencv {
-            k: [row.k[0], row.k[1], row.k[2], 0.0, 0.0, 0.0],
-            p: row.p,
-        }),
+        lens: lens_or_pinhole(Lens::brown(row.k, row.p)),
     };
     let [right, down, forward] = row.axes;
     let pose: Option<DeclaredPose> = pose_from_axes(right, down, forward, row.position);

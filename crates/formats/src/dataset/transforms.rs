@@ -207,10 +207,7 @@ impl CameraKeys {
                         k[3]
                     )));
                 }
-                Lens::Opencv {
-                    k: [k[0], k[1], k[2], 0.0, 0.0, 0.0],
-                    p,
-                }
+                Lens::brown([k[0], k[1], k[2]], p)
             }
             other => {
                 return Err(Malformed(format!(

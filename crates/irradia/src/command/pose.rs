@@ -172,7 +172,7 @@ pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses, anywa
     };
     let (train, test) = (names_of(&dataset.train), names_of(&dataset.test));
     let mut listed = HashSet::new();
-    if let Some(name) = train.iter().chain(&test).find(|name| !listed.insert((*name).clone())) {
+    if let Some(name) = train.iter().chain(&test).find(|name| !listed.insert(*name)) {
         return Err(Usage(format!(
             "several photographs are called {name}, but held-out ones are identified by their names: train with --poses given, or rename \
              them"

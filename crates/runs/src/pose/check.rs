@@ -10,7 +10,7 @@ use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::geometry::pose::DPose;
 use irradia_sfm::map::{
     MIN_MISSING_PAIRS, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, VerifiedPair, agreement, contradictions,
-    evidence_pairs, missing_matches, strengths, verify,
+    evidence_pairs, folded_pairs, missing_matches, strengths, verify,
 };
 use irradia_sfm::matching::{MatchOptions, PairOptions, candidate_pairs, match_pairs};
 use rayon::prelude::*;
@@ -33,9 +33,10 @@ const MIN_CONTRADICTING_SHARE: f64 = 0.1;
 /// How well matches between photographs agree with their poses.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PoseCheck {
-    /// Number of pairs of adjacent photographs with enough matches to count as evidence.
+    /// Number of pairs that count as evidence: those of adjacent photographs with enough matches, and those across folds.
     pub pairs: usize,
-    /// Names of the pairs whose matches contradict their poses, those with the most matches first.
+    /// Names of the pairs whose matches contradict their poses: adjacent ones, those with the most matches first, then weaker ones across
+    /// folds.
     pub contradicting: Vec<[String; 2]>,
     /// Contradicting pairs whose photographs both agree with others: the poses jump there.
     pub jumps: Vec<[String; 2]>,
@@ -89,13 +90,15 @@ pub fn check_poses(dataset: &Dataset) -> PoseCheck {
     let agreement = agreement(&photos, &features, &pairs, &model);
     let supported = find_supported(photos.len(), &pairs, &strengths, &agreement);
     let names = |pair: [u32; 2]| pair.map(|photo| photos[photo as usize].name.clone());
-    let contradicting: Vec<[u32; 2]> = contradictions(&pairs, &strengths, &agreement)
-        .into_iter()
-        .map(|i| pairs[i].photos)
-        .collect();
+    let evidence: BTreeSet<usize> = evidence_pairs(&pairs, &strengths).collect();
+    let mut across = folded_pairs(photos.len(), &pairs, &strengths, &agreement);
+    across.retain(|i| !evidence.contains(i));
+    let mut contradicting = contradictions(&pairs, &strengths, &agreement);
+    contradicting.extend(&across);
+    let contradicting: Vec<[u32; 2]> = contradicting.into_iter().map(|i| pairs[i].photos).collect();
     let jump = |photos: &&[u32; 2]| photos.iter().all(|photo| supported[*photo as usize]);
     PoseCheck {
-        pairs: evidence_pairs(&pairs, &strengths).count(),
+        pairs: evidence.len() + across.len(),
         jumps: contradicting.iter().filter(jump).copied().map(names).collect(),
         contradicting: contradicting.into_iter().map(names).collect(),
         absent: if absent.len() >= MIN_MISSING_PAIRS {

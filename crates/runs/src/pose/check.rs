@@ -7,7 +7,6 @@
 use super::view_features::{ViewFeatures, pose};
 use irradia_scene::{Dataset, View};
 use irradia_sfm::geometry::camera::DCamera;
-use irradia_sfm::geometry::pose::DPose;
 use irradia_sfm::map::{
     MIN_MISSING_PAIRS, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, VerifiedPair, agreement, contradictions,
     evidence_pairs, folded_pairs, missing_matches, strengths, verify,
@@ -84,7 +83,7 @@ pub fn check_poses(dataset: &Dataset) -> PoseCheck {
     let strengths = strengths(&photos, &features, &pairs);
     let model = Model {
         cameras: photos.iter().map(|photo| photo.camera).collect(),
-        poses: poses(&views),
+        poses: views.iter().map(|view| Some(pose(&view.camera))).collect(),
         ..Model::default()
     };
     let agreement = agreement(&photos, &features, &pairs, &model);
@@ -153,19 +152,4 @@ fn find_supported(photos: usize, pairs: &[VerifiedPair], strengths: &[f64], agre
         agreeing[photo as usize] += 1;
     }
     agreeing.into_iter().map(|agreeing| agreeing >= MIN_AGREEING).collect()
-}
-
-/// The poses, moved and scaled such that the cameras' mean position is the origin and their median distance from it is 1.
-fn poses(views: &[&View]) -> Vec<Option<DPose>> {
-    let mut poses: Vec<DPose> = views.iter().map(|view| pose(&view.camera)).collect();
-    let middle = poses.iter().map(|pose| pose.position).sum::<glam::DVec3>() / poses.len().max(1) as f64;
-    let mut distances: Vec<f64> = poses.iter().map(|pose| pose.position.distance(middle)).collect();
-    distances.sort_by(f64::total_cmp);
-    let scale = distances
-        .get(distances.len() / 2)
-        .map_or(1.0, |distance| distance.max(f64::MIN_POSITIVE));
-    poses
-        .iter_mut()
-        .for_each(|pose| pose.position = (pose.position - middle) / scale);
-    poses.into_iter().map(Some).collect()
 }

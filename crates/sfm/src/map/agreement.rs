@@ -15,7 +15,7 @@ const MAX_EXAMINED_MATCHES: usize = 100;
 const MAX_INLIER_ERROR_ON_PLANE: f64 = 0.01;
 /// A pair contradicts the model if less than this fraction of its matches agree.
 pub(super) const MIN_CONSISTENT_FRACTION: f64 = 0.3;
-/// Distance between two cameras, in units of the model, below which their pair only turns.
+/// Distance between two cameras, relative to that of the cameras from the centre of the scene, up to which their pair only turns.
 const MIN_BASELINE: f64 = 0.003;
 /// Number of a photograph's strongest partners that are its neighbours: parts that only look alike share less than one part does.
 const NEIGHBOUR_COUNT: usize = 3;
@@ -31,6 +31,8 @@ pub fn agreement(
     pairs: &[VerifiedPair],
     model: &Model,
 ) -> Vec<Option<f64>> {
+    // A model may have any unit: metres, or that of poses that were known.
+    let (_, radius) = model.center_and_radius();
     let inlier_fraction = |pair: &VerifiedPair| {
         let [a, b] = pair.photos.map(|p| model.poses[p as usize]);
         let (a, b) = (a?, b?);
@@ -39,7 +41,7 @@ pub fn agreement(
         let points = normalized_matches(pair, features, [camera_a, camera_b]);
         let rotation = b.rotation.inverse() * a.rotation;
         let baseline = b.camera_from_world(a.position);
-        if baseline.length() < MIN_BASELINE {
+        if baseline.length() <= MIN_BASELINE * radius {
             let turn = DMat3::from_quat(rotation);
             let is_inlier = |p: &&[DVec2; 2]| rotates(&turn, **p, MAX_INLIER_ERROR_ON_PLANE);
             return Some(points.iter().filter(is_inlier).count() as f64 / points.len().max(1) as f64);
@@ -167,4 +169,86 @@ pub fn near_in_tree(photos: usize, pairs: &[VerifiedPair], tree: &[usize], hops:
         .iter()
         .map(|pair| near[pair.photos[0] as usize].contains(&(pair.photos[1] as usize)))
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::types::{ModelPoint, PairKind};
+    use super::*;
+    use crate::Keypoint;
+    use crate::geometry::align::Alignment;
+    use crate::geometry::pose::DPose;
+    use glam::{DQuat, DVec3};
+    use irradia_scene::Rng;
+
+    #[test]
+    fn the_unit_of_a_model_does_not_matter() {
+        let camera = DCamera::centered(1000, 1000, 1000.0);
+        // Two cameras a degree apart on the unit circle around random points.
+        let mut poses = [0.0f64, 1.0].map(|degrees| {
+            let turn = DQuat::from_rotation_y(-degrees.to_radians());
+            Some(DPose {
+                rotation: turn,
+                position: turn * DVec3::NEG_Z,
+            })
+        });
+        let mut rng = Rng::new(1, 1);
+        let points: Vec<DVec3> = (0..60)
+            .map(|_| DVec3::from_array([0; 3].map(|_| f64::from(rng.range(-0.2, 0.2)))))
+            .collect();
+        let shown = |pose: &Option<DPose>| {
+            let keypoint = |point: &DVec3| {
+                let at = camera.pixel(pose.unwrap().camera_from_world(*point)).as_vec2();
+                Keypoint {
+                    x: at.x,
+                    y: at.y,
+                    scale: 2.0,
+                    angle: 0.0,
+                }
+            };
+            Features {
+                keypoints: points.iter().map(keypoint).collect(),
+                ..Features::default()
+            }
+        };
+        let features = poses.each_ref().map(shown);
+        let pair = VerifiedPair {
+            photos: [0, 1],
+            matches: (0..60).map(|i| [i, i]).collect(),
+            kind: PairKind::General,
+            motion: Motion {
+                rotation: DQuat::IDENTITY,
+                translation: DVec3::X,
+            },
+            angle: 0.0,
+        };
+        let photos = [0; 2].map(|_| PhotoInfo::new(String::new(), 1000, 1000));
+        let agrees_at = |scale: f64, poses: &[Option<DPose>]| {
+            let point = |position: &DVec3| ModelPoint {
+                position: *position,
+                track: vec![(0, 0), (1, 0)],
+                error: 0.0,
+            };
+            let mut model = Model {
+                cameras: vec![Some(camera)],
+                poses: poses.to_vec(),
+                points: points.iter().map(point).collect(),
+                focal_held: vec![false],
+            };
+            model.align(&Alignment {
+                scale,
+                rotation: DQuat::from_rotation_x(0.3),
+                translation: scale * DVec3::new(5.0, -3.0, 7.0),
+            });
+            agreement(&photos, &features, std::slice::from_ref(&pair), &model)[0].unwrap()
+        };
+        for scale in [0.01, 0.1, 1.0, 1000.0] {
+            assert_eq!(agrees_at(scale, &poses), 1.0, "{scale}");
+        }
+        // Cameras at one place: what they see differs by more than a turn.
+        poses[1].as_mut().unwrap().position = poses[0].unwrap().position;
+        for scale in [0.01, 1.0, 1000.0] {
+            assert_eq!(agrees_at(scale, &poses), 0.0, "{scale}");
+        }
+    }
 }

@@ -3,9 +3,9 @@
 use super::Input;
 use super::model::GrowingModel;
 use super::types::{LeftOut, Model, ModelPoint, PairKind, PhotoInfo, Reason, VerifiedPair};
+use crate::PairMatches;
 use crate::geometry::align::Alignment;
 use crate::upright::up;
-use crate::{PairMatches, median};
 use glam::{DQuat, DVec3};
 use irradia_scene::survey;
 
@@ -60,19 +60,8 @@ fn upright(model: &Model, photos: &[PhotoInfo]) -> Alignment {
     let survey = survey(&poses, points).filter(|_| is_up_unknown);
     let up = survey.map_or_else(mean_up, |survey| survey.up);
     let rotation = DQuat::from_rotation_arc(up, DVec3::Z);
-    let median_or_zero = |values| median(values).unwrap_or(0.0);
-    let center = DVec3::from_array(
-        [0, 1, 2].map(|axis| median_or_zero(model.points.iter().map(|p| p.position[axis]).collect())),
-    );
-    let distance = median_or_zero(
-        model
-            .poses
-            .iter()
-            .flatten()
-            .map(|p| (p.position - center).length())
-            .collect(),
-    );
-    let scale = if distance > 0.0 { 1.0 / distance } else { 1.0 };
+    let (center, radius) = model.center_and_radius();
+    let scale = if radius > 0.0 { 1.0 / radius } else { 1.0 };
     Alignment {
         scale,
         rotation,

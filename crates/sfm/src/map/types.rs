@@ -5,7 +5,7 @@ use crate::geometry::align::Alignment;
 use crate::geometry::camera::DCamera;
 use crate::geometry::essential::Motion;
 use crate::geometry::pose::DPose;
-use crate::{Features, PairMatches};
+use crate::{Features, PairMatches, median};
 use glam::{DQuat, DVec3};
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -355,6 +355,20 @@ impl Model {
         for point in &mut self.points {
             point.position = alignment.point(point.position);
         }
+    }
+
+    /// The centre of the scene, the median of the points along each axis or, without points, the mean of the cameras; and the median
+    /// distance of the cameras from it.
+    pub(super) fn center_and_radius(&self) -> (DVec3, f64) {
+        let cameras = || self.poses.iter().flatten().map(|pose| pose.position);
+        let center = if self.points.is_empty() {
+            cameras().sum::<DVec3>() / self.registered().max(1) as f64
+        } else {
+            let along = |axis: usize| median(self.points.iter().map(|p| p.position[axis]).collect());
+            DVec3::from_array([0, 1, 2].map(|axis| along(axis).unwrap_or(0.0)))
+        };
+        let distances = cameras().map(|position| position.distance(center));
+        (center, median(distances.collect()).unwrap_or(0.0))
     }
 
     /// Mean reprojection error, px.

@@ -81,12 +81,13 @@ pub struct Finding {
     thumbnail_photos: Vec<usize>,
 }
 
-/// A camera, or a place from which to take a photograph, in the coordinates of the model.
+/// A camera, or a place from which to take a photograph. The coordinates are those of the model or, if it kept poses that were known,
+/// those in which it is upright.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Place {
     /// The photograph's name; empty for one to be taken.
     pub name: String,
-    /// Position; up is +Z, the cameras' median distance from the origin is 1.
+    /// Position; up is +Z, and the cameras' median distance from the origin is 1, unless the model is in metres.
     pub position: [f64; 3],
     /// Unit viewing direction.
     pub forward: [f64; 3],
@@ -126,7 +127,7 @@ pub fn doctor(input: &DoctorInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> 
         cameras,
         ..Reconstruction::default()
     };
-    let mut report = examine(&work, &infos, &pairs, &found, None);
+    let mut report = examine(&work, &infos, &pairs, &found, None, false);
     add_unreadable(&mut report, folder, &work);
     report.seconds = started.elapsed().as_secs_f64();
     if let Some(out) = &input.out {
@@ -135,15 +136,19 @@ pub fn doctor(input: &DoctorInput, progress: &(dyn Fn(PoseProgress) + Sync)) -> 
     Ok(report)
 }
 
-/// Diagnoses a capture after verification, or after mapping if there is a model; `masked` is what stood still before it was masked.
+/// Diagnoses a capture after verification, or after mapping if there is a model; `masked` is what stood still before it was masked. The
+/// world of `is_known` poses may have any origin, unit and up.
 pub(super) fn examine(
     work: &Work,
     infos: &[PhotoInfo],
     matches: &[PairMatches],
     found: &Reconstruction,
     masked: Option<&StillRegion>,
+    is_known: bool,
 ) -> DoctorReport {
-    let model = found.models.first();
+    let upright = found.models.first().filter(|_| is_known);
+    let upright = upright.map(|model| model.clone().upright(infos));
+    let model = upright.as_ref().or(found.models.first());
     let evidence = Evidence {
         photos: infos,
         appearances: work.appearances(),

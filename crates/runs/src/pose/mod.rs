@@ -475,7 +475,14 @@ impl Posing<'_> {
         };
         self.clock.end("poses");
         let still_region = masked.map(|masked| &masked.still);
-        let mut examined = doctor::examine(&work, &infos, &pairs, &reconstruction, still_region);
+        let mut examined = doctor::examine(
+            &work,
+            &infos,
+            &pairs,
+            &reconstruction,
+            still_region,
+            known_model.is_some(),
+        );
         doctor::add_unreadable(&mut examined, folder, &work);
         doctor::write(out, folder, &work, &examined)?;
         self.clock.end("doctor");

@@ -21,7 +21,8 @@ pub struct Shot {
     pub forward: DVec3,
 }
 
-/// Photographs that would repair a fault between two posed photographs, from one to the other; none for other faults.
+/// Photographs that would repair a fault between two posed photographs, from one to the other; none for other faults. In `model`, +Z is up
+/// and the centre of the scene is on the vertical axis through the origin ([`Model::upright`]).
 pub fn shots(diagnosis: &Diagnosis, model: &Model) -> Vec<Shot> {
     let ([a, b], min_shots) = match diagnosis {
         Diagnosis::Gap { sides: ends, .. } | Diagnosis::OpenLoop { ends, .. } => (*ends, 1),
@@ -73,6 +74,9 @@ fn shots_between(a: &DPose, b: &DPose, min_shots: usize) -> Vec<Shot> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geometry::align::Alignment;
+    use crate::map::{ModelPoint, PhotoInfo};
+    use glam::DMat3;
 
     /// A camera on the unit circle that looks at the origin.
     fn at(degrees: f64) -> DPose {
@@ -105,5 +109,45 @@ mod tests {
         };
         assert!(shots(&unposed, &model).is_empty());
         assert!(shots(&Diagnosis::Duplicate { photos: [0, 1] }, &model).is_empty());
+    }
+
+    #[test]
+    fn a_gap_is_filled_along_its_arc_in_the_world_of_known_poses() {
+        let level = |degrees: f64| {
+            let back = DQuat::from_rotation_z(degrees.to_radians()) * DVec3::X;
+            let axes = DMat3::from_cols(DVec3::Z.cross(back), DVec3::NEG_Z, -back);
+            DPose {
+                rotation: DQuat::from_mat3(&axes),
+                position: back,
+            }
+        };
+        let point = |position: DVec3| ModelPoint {
+            position,
+            track: Vec::new(),
+            error: 0.0,
+        };
+        let mut model = Model {
+            cameras: vec![None],
+            poses: (0..11).map(|i| Some(level(31.0 * f64::from(i)))).collect(),
+            points: [DVec3::ZERO, DVec3::X, DVec3::Y, DVec3::Z].map(point).to_vec(),
+            focal_held: vec![false],
+        };
+        let photos = [0; 11].map(|_| PhotoInfo::new(String::new(), 100, 100));
+        // Y points down, and the scene is far from the origin.
+        model.align(&Alignment {
+            scale: 20.0,
+            rotation: DQuat::from_rotation_x(1.6),
+            translation: DVec3::new(100.0, 200.0, -50.0),
+        });
+        let gap = Diagnosis::Gap {
+            sides: [10, 0],
+            degrees: 50.0,
+        };
+        let found = shots(&gap, &model.upright(&photos));
+        assert_eq!(found.len(), 3);
+        for shot in found {
+            assert!(shot.position.z.abs() < 1e-6 && (shot.position.length() - 1.0).abs() < 1e-6);
+            assert!((shot.forward + shot.position).length() < 1e-6);
+        }
     }
 }

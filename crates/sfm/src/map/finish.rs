@@ -11,9 +11,16 @@ use irradia_scene::survey;
 
 /// The model in its final, upright world.
 pub(super) fn finish(growing: &GrowingModel, photos: &[PhotoInfo]) -> Model {
-    let mut model = extract_model(growing);
-    model.align(&upright(&model, photos));
-    model
+    extract_model(growing).upright(photos)
+}
+
+impl Model {
+    /// The model, which may be in the world of known poses, in one in which +Z is up as far as `photos` show it, the origin is the centre
+    /// of the scene, and the cameras' distance from it is about 1.
+    pub fn upright(mut self, photos: &[PhotoInfo]) -> Self {
+        self.align(&upright(&self, photos));
+        self
+    }
 }
 
 /// The model in the world in which it grew.

@@ -348,7 +348,7 @@ impl Model {
     }
 
     /// Moves poses and points to another world.
-    pub(super) fn align(&mut self, alignment: &Alignment) {
+    pub(crate) fn align(&mut self, alignment: &Alignment) {
         for pose in self.poses.iter_mut().flatten() {
             *pose = alignment.pose(pose);
         }

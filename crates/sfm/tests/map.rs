@@ -96,13 +96,15 @@ fn a_model_is_completed_and_another_beside_it_stays() {
     let apart = pairs(&|[a, b]| a == b && a < 2);
     let joined = pairs(&|[a, b]| a == b || [a, b] == [0, 2]);
     let options = MapOptions::default();
-    let first = reconstruct(&world.photos, &world.features, &apart, &options, &mut |_| ());
+    let mut first = reconstruct(&world.photos, &world.features, &apart, &options, &mut |_| ());
+    first.models[0].focal_held = vec![true];
     let sizes = |found: &Reconstruction| found.models.iter().map(Model::registered).collect::<Vec<_>>();
     assert_eq!((sizes(&first), first.left_out.len()), (vec![16, 4], 4));
     let completed = complete(&world.photos, &world.features, &joined, &first, &options, &mut |_| ());
     assert_eq!((sizes(&completed), completed.left_out.len()), (vec![20, 4], 0));
     let [before, after] = [&first, &completed].map(|found| &found.models[0]);
     assert!(before.poses[..16] == after.poses[..16] && before.cameras == after.cameras);
+    assert_eq!(before.focal_held, after.focal_held);
     assert!(completed.models[1] == first.models[1]);
     let source = |found: &Reconstruction| found.cameras[0].source;
     assert_eq!([&first, &completed].map(source), [FocalSource::Guess; 2]);

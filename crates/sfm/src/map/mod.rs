@@ -312,6 +312,7 @@ pub fn complete(
     let photos = found.regrouped(photos);
     let (largest, others) = found.models.split_first().expect("a model");
     let mut completed = extend(&photos, features, pairs, &largest.into(), options, progress);
+    completed.models[0].focal_held.clone_from(&largest.focal_held);
     let poses = &completed.models[0].poses;
     let shares = |other: &&Model| poses.iter().zip(&other.poses).any(|(a, b)| a.is_some() && b.is_some());
     let others: Vec<Model> = others.iter().filter(|other| !shares(other)).cloned().collect();

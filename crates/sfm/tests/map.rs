@@ -559,6 +559,22 @@ fn too_little_has_one_clear_outcome() {
 }
 
 #[test]
+fn photographs_by_a_camera_that_did_not_move_say_so() {
+    let mut world = World::new(around(8, 0.0), 300, 0.0, 0.0, 8);
+    world.features = vec![world.features[0].clone(); 8];
+    let count = world.features[0].keypoints.len();
+    for pair in &mut world.pairs {
+        pair.matches = (0..count as u32).map(|i| [i, i]).collect();
+    }
+    let result = world.map();
+    let reasons: Vec<Reason> = result.left_out.iter().map(|left| left.reason).collect();
+    assert_eq!(reasons, [Reason::StandsStill { best: count }; 8]);
+    // A photograph that matches no other is no part of that.
+    world.pairs.retain(|pair| pair.photos[0] != 0);
+    assert_eq!(world.map().left_out[0].reason, Reason::FewMatches { best: 0 });
+}
+
+#[test]
 fn poison_in_keypoints_and_metadata_does_no_harm() {
     let mut world = World::new(around(8, 0.3), 400, 0.5, 0.1, 9);
     for (i, keypoint) in world.features[3].keypoints.iter_mut().enumerate().take(30) {

@@ -1,8 +1,8 @@
 //! The final result: an upright, centred model, and a reason for each photograph that is in no model.
 
-use super::Input;
 use super::model::GrowingModel;
 use super::types::{LeftOut, Model, ModelPoint, PairKind, PhotoInfo, Reason, VerifiedPair};
+use super::{Input, Unverified};
 use crate::PairMatches;
 use crate::geometry::align::Alignment;
 use crate::upright::up;
@@ -76,10 +76,10 @@ fn upright(model: &Model, photos: &[PhotoInfo]) -> Alignment {
     }
 }
 
-/// Photographs that are in no model, with the reasons; `matches` are those before verification.
+/// Photographs that are in no model, with the reasons.
 pub(super) fn left_out(
     input: &Input,
-    matches: &[PairMatches],
+    unverified: &Unverified,
     assigned: &[bool],
     failed_registrations: &[usize],
 ) -> Vec<LeftOut> {
@@ -96,14 +96,16 @@ pub(super) fn left_out(
         if count < options.min_inliers {
             return Reason::FewFeatures { features: count };
         }
-        let best = matches
-            .iter()
-            .filter(|p| of(&p.photos))
-            .map(|p| p.matches.len())
-            .max()
-            .unwrap_or(0);
+        let best_of = |pairs: &[PairMatches]| {
+            let counts = pairs.iter().filter(|p| of(&p.photos)).map(|p| p.matches.len());
+            counts.max().unwrap_or(0)
+        };
+        let [best, with_still] = [unverified.pairs, unverified.with_still].map(best_of);
+        if with_still < options.min_inliers {
+            return Reason::FewMatches { best: with_still };
+        }
         if best < options.min_inliers {
-            return Reason::FewMatches { best };
+            return Reason::StandsStill { best: with_still };
         }
         let partners: Vec<&VerifiedPair> = pairs.iter().filter(|p| of(&p.photos)).collect();
         if partners.is_empty() {

@@ -164,6 +164,7 @@ impl VotingPair {
             features,
             pairs,
             options,
+            ..
         } = *unverified;
         let pair = &pairs[uncalibrated.pair];
         let points = select(&centered_points(photos, features, pair), &uncalibrated.inliers);

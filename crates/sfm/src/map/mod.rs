@@ -77,11 +77,12 @@ pub fn reconstruct(
     progress: &mut dyn FnMut(Progress),
 ) -> Reconstruction {
     assert_eq!(photos.len(), features.len(), "one set of features per photograph");
-    let pairs = &still::without_still_matches(photos, features, pairs)[..];
+    let moving = &still::without_still_matches(photos, features, pairs)[..];
     let input = Unverified {
         photos,
         features,
-        pairs,
+        pairs: moving,
+        with_still: pairs,
         options,
     };
     let mut known = known_cameras(photos);
@@ -208,8 +209,8 @@ fn map_with_cameras(
     let Unverified {
         photos,
         features,
-        pairs,
         options,
+        ..
     } = *unverified;
     let (cameras, verified) = verify::verify_with(unverified, cameras, progress);
     let input = Input {
@@ -230,7 +231,7 @@ fn map_with_cameras(
         assigned,
         failed_registrations,
     } = found;
-    let left_out = finish::left_out(&input, pairs, &assigned, &failed_registrations);
+    let left_out = finish::left_out(&input, unverified, &assigned, &failed_registrations);
     Reconstruction {
         models,
         left_out,
@@ -257,7 +258,7 @@ pub fn extend(
     progress: &mut dyn FnMut(Progress),
 ) -> Reconstruction {
     assert_eq!(photos.len(), known.poses.len(), "a pose or none per photograph");
-    let pairs = &still::without_still_matches(photos, features, pairs)[..];
+    let moving = &still::without_still_matches(photos, features, pairs)[..];
     // A group without a known pose may have an exact camera nevertheless.
     let held: Vec<_> = (known.cameras.iter().zip(known_cameras(photos)))
         .map(|(camera, exact)| camera.map(exact_camera).or(exact))
@@ -265,7 +266,8 @@ pub fn extend(
     let unverified = Unverified {
         photos,
         features,
-        pairs,
+        pairs: moving,
+        with_still: pairs,
         options,
     };
     let (cameras, verified) = verify::verify_with(&unverified, &held, progress);
@@ -282,7 +284,7 @@ pub fn extend(
     growing.hold(known);
     growing.grow(&vec![false; photos.len()], progress);
     let assigned: Vec<bool> = growing.poses.iter().map(Option::is_some).collect();
-    let left_out = finish::left_out(&input, pairs, &assigned, &growing.failures);
+    let left_out = finish::left_out(&input, &unverified, &assigned, &growing.failures);
     let model = finish::extract_model(&growing);
     Reconstruction {
         missing: missing_matches(photos, &model),
@@ -346,8 +348,10 @@ struct GrownModels {
 struct Unverified<'a> {
     photos: &'a [PhotoInfo],
     features: &'a [Features],
-    /// Matches of all pairs.
+    /// Matches of all pairs, without those that stand still while others move.
     pairs: &'a [PairMatches],
+    /// The same with those that stand still.
+    with_still: &'a [PairMatches],
     options: &'a MapOptions,
 }
 

@@ -410,6 +410,11 @@ pub enum Reason {
         /// Number of matches with the best partner.
         best: usize,
     },
+    /// Nearly all of its matches are at the same pixels of both photographs, as if the camera had not moved, and were left out.
+    StandsStill {
+        /// Number of matches with the best partner, with those that stand still.
+        best: usize,
+    },
     /// Matches that no common geometry explains.
     NoGeometry {
         /// Number of matches with the best partner.
@@ -444,6 +449,11 @@ impl std::fmt::Display for Reason {
                     "at most {best} features match another photograph: none overlaps with it enough"
                 )
             }
+            Reason::StandsStill { best } => write!(
+                f,
+                "nearly all of its matches (at most {best} with one photograph) stand still: move the camera between photographs, or mask \
+                 what stands still"
+            ),
             Reason::NoGeometry { best } => {
                 write!(
                     f,

@@ -54,6 +54,7 @@ pub fn verify(
         photos,
         features,
         pairs,
+        with_still: pairs,
         options,
     };
     verify_with(&unverified, &[], progress)
@@ -70,6 +71,7 @@ pub(super) fn verify_with(
         features,
         pairs,
         options,
+        ..
     } = *unverified;
     let is_known = |photo: &u32| {
         let photo = &photos[*photo as usize];
@@ -426,7 +428,8 @@ mod tests {
         let unverified = Unverified {
             photos: &photos,
             features: &features,
-            pairs: &[pair],
+            pairs: std::slice::from_ref(&pair),
+            with_still: std::slice::from_ref(&pair),
             options: &options,
         };
         let source = FocalSource::Pairs;

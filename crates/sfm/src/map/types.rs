@@ -460,12 +460,14 @@ impl std::fmt::Display for Reason {
                     "its matches (at most {best} with one photograph) agree with no common geometry"
                 )
             }
-            Reason::RotationOnly { partners } => {
-                write!(
-                    f,
-                    "taken from the same place as all {partners} photographs that overlap with it: move between photographs"
-                )
-            }
+            Reason::RotationOnly { partners: 1 } => write!(
+                f,
+                "taken from the same place as the only photograph that overlaps with it: move between photographs"
+            ),
+            Reason::RotationOnly { partners } => write!(
+                f,
+                "taken from the same place as all {partners} photographs that overlap with it: move between photographs"
+            ),
             Reason::NoModel { partners: 1 } => write!(f, "it overlaps with 1 photograph, which is in no model"),
             Reason::NoModel { partners } => {
                 write!(
@@ -481,5 +483,17 @@ impl std::fmt::Display for Reason {
                 )
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_single_partner_is_not_called_all_photographs() {
+        let sentence = |partners: usize| Reason::RotationOnly { partners }.to_string();
+        assert!(sentence(1).contains("the only photograph that overlaps with it"));
+        assert!(sentence(2).contains("all 2 photographs that overlap with it"));
     }
 }

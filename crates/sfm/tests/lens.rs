@@ -46,6 +46,13 @@ fn principal_points_of_photographs_cut_beside_their_middles_are_found() {
     }
 }
 
+#[test]
+fn a_camera_that_is_known_of_one_photograph_is_that_of_its_group() {
+    let mut world = World::new(around(8, 0.3), 400, 0.5, 0.1, 9);
+    world.photos[0].camera = Some(CAMERA);
+    assert_eq!(world.map().models[0].cameras, [Some(CAMERA)]);
+}
+
 /// Photographs of a room, taken all around with a lens of short focal length, 300 px for a width of 1000 px.
 fn wide(fisheye: bool) -> World {
     let mut rng = Rng::new(7, 1);

@@ -187,7 +187,8 @@ fn known_cameras(photos: &[PhotoInfo]) -> Vec<Option<GroupCamera>> {
     let groups = photos.iter().map(|photo| photo.group + 1).max().unwrap_or(0);
     let mut cameras = vec![None; groups];
     for photo in photos {
-        cameras[photo.group] = photo.camera.map(exact_camera);
+        let camera = &mut cameras[photo.group];
+        *camera = camera.or(photo.camera.map(exact_camera));
     }
     cameras
 }

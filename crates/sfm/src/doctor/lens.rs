@@ -95,9 +95,11 @@ pub(super) fn cropped(evidence: &Evidence) -> Vec<Diagnosis> {
 pub(super) fn focal_unknown(evidence: &Evidence) -> Vec<Diagnosis> {
     let mut found = Vec::new();
     for (group, camera) in evidence.cameras.iter().enumerate() {
-        let held = evidence
-            .model()
-            .is_some_and(|model| model.focal_held.get(group) == Some(&true));
+        // A focal length from the metadata may be held as well, but it is no guess.
+        let held = camera.source != FocalSource::Prior
+            && evidence
+                .model()
+                .is_some_and(|model| model.focal_held.get(group) == Some(&true));
         let of_group = |photo: usize| evidence.photos[photo].group == group;
         let photos: Vec<usize> = (0..evidence.photos.len()).filter(|p| of_group(*p)).collect();
         let pairs = || {
@@ -119,4 +121,44 @@ pub(super) fn focal_unknown(evidence: &Evidence) -> Vec<Diagnosis> {
         }
     }
     found
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::camera::DCamera;
+    use crate::map::{GroupCamera, Model, PhotoInfo};
+
+    #[test]
+    fn a_focal_length_from_metadata_is_no_guess() {
+        let camera = DCamera::centered(100, 100, 90.0);
+        let photos = [0; 3].map(|_| PhotoInfo::new(String::new(), 100, 100));
+        let models = [Model {
+            cameras: vec![Some(camera)],
+            poses: vec![None; 3],
+            points: Vec::new(),
+            focal_held: vec![true],
+        }];
+        let found = |source: FocalSource| {
+            focal_unknown(&Evidence {
+                photos: &photos,
+                appearances: &[],
+                features: &[],
+                colors: &[],
+                matches: &[],
+                masked: None,
+                pairs: &[],
+                cameras: &[GroupCamera { camera, source }],
+                models: &models,
+                zooms: &[],
+                own_focals: false,
+                missing: &[],
+                split_models: None,
+                left_out: &[],
+            })
+        };
+        assert_eq!(found(FocalSource::Prior), []);
+        let guess = Diagnosis::FocalUnknown { photos: vec![0, 1, 2] };
+        assert_eq!(found(FocalSource::Guess), [guess]);
+    }
 }

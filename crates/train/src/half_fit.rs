@@ -92,6 +92,7 @@ fn fitted_pose(model: &Model, renderer: &mut Renderer, view: &HeldOut, fit: Half
         truth,
         mask,
         options,
+        vignette,
         extent,
         ..
     } = *view;
@@ -121,13 +122,16 @@ fn fitted_pose(model: &Model, renderer: &mut Renderer, view: &HeldOut, fit: Half
         camera.intrinsics = *intrinsics;
         let width = intrinsics.width;
         let counts = |i: usize| is_left(i, width as usize) && mask.as_ref().is_none_or(|mask| mask[i] != 0);
-        let render = model.render(renderer, &camera, options).color;
+        let render = vignetted(vignette, &camera, model.render(renderer, &camera, options).color);
         let map = if fit.exposure {
             Affine::fit_unclipped(&render, truth, counts)
         } else {
             Affine::IDENTITY
         };
-        let v_color = squared_error_gradient(&render, truth, &map, counts);
+        let mut v_color = squared_error_gradient(&render, truth, &map, counts);
+        if let Some(vignette) = vignette {
+            vignette.backward(&camera.intrinsics, renderer.color(), &mut v_color);
+        }
         let v_out = OutputGradient {
             camera: true,
             ..OutputGradient::of_color(&v_color)
@@ -165,6 +169,7 @@ fn squared_error_gradient(render: &Image, truth: &Image, map: &Affine, counts: i
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::tensor_file::{NamedTensor, to_bytes};
     use glam::Vec3;
     use irradia_scene::{Intrinsics, Pose, Rng};
     use irradia_splat::Splats;
@@ -218,5 +223,35 @@ mod tests {
         eprintln!("neither {neither:.1}, exposure {exposure:.1}, pose {pose:.1}, both {both:.1} dB");
         assert!(exposure > neither + 2.0 && both > exposure + 8.0 && both > pose + 8.0);
         assert!(both > 38.0, "8 bits allow about 50 dB, the final learning rate less");
+    }
+
+    #[test]
+    fn a_pose_is_fitted_to_frames_as_the_lens_shows_them() {
+        let (model, camera) = scene();
+        let (mut renderer, options) = (Renderer::new(), RenderOptions::default());
+        let k = &camera.intrinsics;
+        let lens = [64.0 / 96.0, k.fx / 96.0];
+        let tensors = [
+            NamedTensor::f32s("lenses", vec![1, 2], &lens),
+            NamedTensor::f32s("curves", vec![1, 3], &[-0.5, 0.0, -0.2]),
+        ];
+        let vignette = Vignette::from_file(&to_bytes(&tensors, ("irradia_vignette", "1".into()))).unwrap();
+        let truth = vignette.apply_to(k, model.render(&mut renderer, &camera, &options).color);
+        let truth = truth.rounded_to_8_bits();
+        let off = corrected(&camera, [0.006, -0.008, 0.004, 0.01, 0.0, -0.01]);
+        let view = HeldOut {
+            camera: &off,
+            truth: &truth,
+            mask: None,
+            options: &options,
+            vignette: Some(&vignette),
+            extent: 1.0,
+        };
+        let fit = HalfFit {
+            exposure: false,
+            pose: true,
+        };
+        let psnr = half_fit_psnr(&model, &mut renderer, &view, fit).expect("no mask");
+        assert!(psnr > 38.0, "{psnr:.1} dB: as without a vignette");
     }
 }

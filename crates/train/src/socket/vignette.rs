@@ -192,6 +192,13 @@ impl Vignette {
         sum_of(&sums)
     }
 
+    /// The vector-Jacobian product of [`Self::apply`] for a trained curve: `v` `[3, H, W]` becomes the gradient of `color`.
+    pub(crate) fn backward(&self, k: &Intrinsics, color: &[f32], v: &mut [f32]) {
+        if let Some(lens) = self.lens_of(k) {
+            self.vjp(lens, k, color, v);
+        }
+    }
+
     /// The vector-Jacobian product of [`Self::apply`], and a step of Adam at `rate`.
     pub fn step(&mut self, k: &Intrinsics, color: &[f32], v: &mut [f32], rate: f32) {
         let Some(lens) = self.lens_of(k) else {

@@ -453,7 +453,7 @@ fn restore_views(trainer: &mut Trainer, tensors: TensorSource) -> Result<(), Tra
         if trained.is_empty() || !trained.iter().all(known) {
             return Err(damaged(format!("{TRAINED_TENSOR} and the dataset do not agree")));
         }
-        trainer.trained = trained.iter().map(|view| *view as usize).collect();
+        trainer.train_on(trained.iter().map(|view| *view as usize).collect());
     }
     if let Some(pairs) = tensors.u64s(HIDDEN_TENSOR) {
         let camera = |view: usize| trainer.dataset.views.get(view).map(|view| &view.camera);

@@ -7,6 +7,7 @@ use glam::Vec3;
 use irradia_scene::{Dataset, PointCloud, View};
 use irradia_splat::SplatState;
 use rayon::prelude::*;
+use std::collections::HashSet;
 
 /// Minimum number of points that a view sees for its nearest depth to be known.
 const MIN_POINTS: usize = 20;
@@ -39,6 +40,8 @@ pub(crate) struct FreeSpace {
 /// A sector of a sphere around a camera.
 #[derive(Clone, Debug)]
 struct Cone {
+    /// The camera's view.
+    view: usize,
     apex: Vec3,
     /// The camera's axis, of unit length.
     axis: Vec3,
@@ -69,8 +72,8 @@ impl FreeSpace {
             return Self::default();
         }
         let certain = certain_points(dataset);
-        let cone = |view: &usize| {
-            let view = &dataset.views[*view];
+        let cone = |index: &usize| {
+            let view = &dataset.views[*index];
             let mut radius = fraction * nearest_depth(dataset, view)?;
             let around = dataset.points.as_ref().map(|points| distance_to_points(points, view));
             if let Some(around) = around.filter(|around| *around < radius) {
@@ -82,6 +85,7 @@ impl FreeSpace {
                 .iter()
                 .map(|point| (*point, SUPPORT_RATIO * point.distance(apex)));
             Some(Cone {
+                view: *index,
                 apex,
                 axis: pose.rotation * Vec3::Z,
                 // A wide lens may see everything around it.
@@ -99,6 +103,11 @@ impl FreeSpace {
         Self {
             cones: dataset.train.par_iter().filter_map(cone).collect(),
         }
+    }
+
+    /// Keeps the cones of these views only.
+    pub(crate) fn keep(&mut self, views: &HashSet<usize>) {
+        self.cones.retain(|cone| views.contains(&cone.view));
     }
 
     /// Removes the splats centred in a cone; returns their number.

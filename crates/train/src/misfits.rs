@@ -54,6 +54,16 @@ fn misfits(errors: &[(usize, [f64; 2])]) -> Vec<(usize, f64)> {
 }
 
 impl Trainer {
+    /// Trains on the views `trained` only from now on. What the others show, and where they stand, is no evidence of empty space any more.
+    pub(crate) fn train_on(&mut self, trained: Vec<usize>) {
+        let views = trained.iter().copied().collect();
+        self.free_space.keep(&views);
+        if let Some(surroundings) = &mut self.surroundings {
+            surroundings.keep(&views);
+        }
+        self.trained = trained;
+    }
+
     /// Leaves out the photographs whose `errors`, over all pixels and over those that fit best, are misfits, and reports their names.
     pub(crate) fn leave_out_misfits(&mut self, errors: &[(usize, [f64; 2])]) -> Option<Event> {
         let found = misfits(errors);
@@ -70,8 +80,9 @@ impl Trainer {
                 "{n} of {count} photographs do not fit the others, too many to leave out; are their poses right? {names}"
             )
         } else {
-            self.trained
-                .retain(|view| found.iter().all(|(misfit, _)| misfit != view));
+            let mut trained = self.trained.clone();
+            trained.retain(|view| found.iter().all(|(misfit, _)| misfit != view));
+            self.train_on(trained);
             format!(
                 "{n} of {count} photographs do not fit the others and are left out from here on (--set drop_misfits=false keeps them); are their poses right? {names}"
             )
@@ -83,7 +94,13 @@ impl Trainer {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use irradia_scene::Rng;
+    use crate::checkpoint::{from_bytes, to_bytes};
+    use crate::surroundings::tests::around;
+    use crate::{Recipe, TrainOptions};
+    use glam::Vec3;
+    use irradia_scene::{Pose, Rng};
+    use irradia_splat::{SplatState, Splats};
+    use std::sync::Arc;
 
     #[test]
     fn wrong_photographs_are_found_and_odd_ones_are_not() {
@@ -114,5 +131,41 @@ mod tests {
         let mut found: Vec<usize> = misfits(&both).iter().map(|(view, _)| *view).collect();
         found.sort_unstable();
         assert_eq!(found, [3, 40]);
+    }
+
+    #[test]
+    fn what_a_misfit_sees_does_not_count_any_more() {
+        // Nine cameras on a circle, and one with a wrong pose. The first splat is opposite the first camera, where the wrong one sees it as
+        // well; the second one is close before the wrong camera.
+        let mut data = around(9);
+        let (opposite, eye) = (Vec3::new(-1.0, 0.05, 0.02), Vec3::new(1.0, 0.0, 1.0));
+        let mut wrong = data.views[0].clone();
+        wrong.camera.pose = Pose::look_at(eye, opposite, Vec3::Y);
+        data.views.push(wrong);
+        data.train.push(9);
+        (data.views.iter_mut()).for_each(|view| view.depth_bounds = Some([0.2, 9.0]));
+        let data = Arc::new(data);
+        let set = ["free_space=0.7".to_owned()];
+        let recipe = Recipe::parse("classic", Recipe::built_in("classic").unwrap(), &set).unwrap();
+        let options = TrainOptions::default();
+        let mut trainer = Trainer::from_splats(data.clone(), recipe, options.clone(), Splats::zeros(4, 0)).unwrap();
+        let cleared_and_moved = |trainer: &Trainer| {
+            let mut splats = Splats::zeros(2, 0);
+            let places = [opposite, eye.lerp(opposite, 0.05)];
+            for (i, place) in places.into_iter().enumerate() {
+                (0..3).for_each(|c| splats.means.set(c, i, place[c]));
+            }
+            let mut state = SplatState::new(splats);
+            let cleared = trainer.free_space.clear(&mut state);
+            [cleared, trainer.surroundings.as_ref().unwrap().move_away(&mut state)]
+        };
+        assert_eq!(cleared_and_moved(&trainer), [1, 0]);
+        let errors: Vec<(usize, [f64; 2])> = (0..10).map(|i| (i, [if i == 9 { 0.5 } else { 0.05 }; 2])).collect();
+        trainer.leave_out_misfits(&errors).expect("one is left out");
+        assert_eq!(trainer.trained, (0..9).collect::<Vec<_>>());
+        let resumed = from_bytes(&to_bytes(&trainer), data, options).unwrap();
+        for trainer in [trainer, resumed] {
+            assert_eq!(cleared_and_moved(&trainer), [0, 1]);
+        }
     }
 }

@@ -14,6 +14,7 @@ use glam::Vec3;
 use irradia_scene::{Camera, Dataset};
 use irradia_splat::{SplatState, init};
 use rayon::prelude::*;
+use std::collections::HashSet;
 
 /// Distance from the focus beyond which splats may be among the cameras. This and the following distances are in units of the cameras'
 /// median distance from their focus.
@@ -28,8 +29,8 @@ const FAR_DISTANCE: f32 = 3.0;
 /// The cameras of sparse photographs, and the points that are known.
 #[derive(Clone, Debug)]
 pub(crate) struct Surroundings {
-    /// Cameras of the training photographs, at full size.
-    cameras: Vec<Camera>,
+    /// Views and cameras of the training photographs, at full size.
+    cameras: Vec<(usize, Camera)>,
     points: Vec<Vec3>,
     focus: Vec3,
     /// Median distance of the cameras from their focus, world units.
@@ -48,10 +49,15 @@ impl Surroundings {
         let distances = cameras.iter().map(|camera| camera.pose.position.distance(focus).into());
         Some(Self {
             distance: median(distances.collect()) as f32,
-            cameras,
+            cameras: dataset.train.iter().copied().zip(cameras).collect(),
             points,
             focus,
         })
+    }
+
+    /// Keeps the cameras of these views only.
+    pub(crate) fn keep(&mut self, views: &HashSet<usize>) {
+        self.cameras.retain(|(view, _)| views.contains(view));
     }
 
     /// Moves splats far away if only one photograph shows them, beyond the focus and among other cameras. Returns their number.
@@ -90,17 +96,14 @@ impl Surroundings {
         if is_within(self.focus, min_focus) || !is_within(self.focus, far) {
             return None;
         }
-        let mut seeing = self.cameras.iter().filter(|camera| camera.sees(position).is_some());
+        let cameras = || self.cameras.iter().map(|(_, camera)| camera);
+        let mut seeing = cameras().filter(|camera| camera.sees(position).is_some());
         let (eye, None) = (seeing.next()?.pose.position, seeing.next()) else {
             return None;
         };
         let along = position - eye;
         let is_beyond_focus = along.dot(position - self.focus) > 0.0;
-        let is_among_cameras = || {
-            self.cameras
-                .iter()
-                .any(|camera| is_within(camera.pose.position, max_camera))
-        };
+        let is_among_cameras = || cameras().any(|camera| is_within(camera.pose.position, max_camera));
         if !is_beyond_focus || !is_among_cameras() || self.points.iter().any(|point| is_within(*point, min_point)) {
             return None;
         }
@@ -117,7 +120,7 @@ impl Surroundings {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use crate::spacing::{spacing, tests::around_at};
     use irradia_scene::{Intrinsics, PointCloud};
@@ -125,7 +128,7 @@ mod tests {
     use std::f32::consts::TAU;
 
     /// `count` cameras on a circle of radius 1 around the origin, which look across it and see 30 degrees, and a point at the origin.
-    fn around(count: usize) -> Dataset {
+    pub(crate) fn around(count: usize) -> Dataset {
         let mut data = around_at(1.0, count, TAU);
         for view in &mut data.views {
             view.camera.intrinsics = Intrinsics::from_fov_x(100, 100, TAU / 12.0);

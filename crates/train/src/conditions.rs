@@ -18,6 +18,7 @@
 use crate::depth_maps::DepthMaps;
 use crate::first_splats::has_points;
 use crate::normal_maps::NormalMaps;
+use crate::photos::caught;
 use crate::recipe::{Param, Params};
 use crate::robust::median;
 use crate::schedule::Clock;
@@ -168,7 +169,7 @@ impl Trainer {
                 let k = &view.camera.intrinsics;
                 let small = k.scaled((SAMPLE_SIDE as f32 / k.width.max(k.height) as f32).min(1.0));
                 // A photograph that cannot be read makes the first step fail, from which the run can be resumed.
-                let Ok(photo) = view.photo.load_at(small.width, small.height) else {
+                let Ok(photo) = caught(&view.name, || view.photo.load_at(small.width, small.height)) else {
                     continue;
                 };
                 photographs += 1;

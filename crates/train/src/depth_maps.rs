@@ -7,6 +7,7 @@
 //! the inverse depths of one network in this way). Fitted depths are in world units. Without points, maps are taken for depths, and the
 //! loss itself fits scale and shift to each frame.
 
+use crate::photos::caught;
 use crate::recipe::Param;
 use crate::robust::median;
 use crate::schedule::StepPlan;
@@ -82,7 +83,8 @@ impl DepthMaps {
     pub fn read(dataset: &Dataset) -> Self {
         let read = |view: &usize| {
             let view = &dataset.views[*view];
-            let grid = view.depth_map.as_ref()?.load();
+            let source = view.depth_map.as_ref()?;
+            let grid = caught(&view.name, || source.load());
             Some(grid.map(|grid| {
                 let pairs = pairs(dataset, view, &grid);
                 let enough = pairs.len() >= MIN_POINTS;
@@ -325,6 +327,15 @@ mod tests {
         }
     }
 
+    /// A source whose decoder has a bug.
+    struct Panicking;
+
+    impl GridSource<f32> for Panicking {
+        fn load(&self) -> Result<DepthGrid, LoadError> {
+            panic!("a decoder's bug")
+        }
+    }
+
     /// Depth of a slanted floor that the camera at the origin sees at these fractions of its image.
     fn floor(x: f32, y: f32) -> f32 {
         2.0 + 3.0 * x + 5.0 * y * y
@@ -445,6 +456,17 @@ mod tests {
         );
         let counts = |view| maps.samples(view, &camera()).is_some();
         assert_eq!([0, 1, 2, 3].map(counts), [true, false, false, false]);
+    }
+
+    #[test]
+    fn a_map_on_which_the_decoder_panics_is_one_that_cannot_be_read() {
+        let maps = DepthMaps::read(&dataset(vec![map(|z| z), Some(Arc::new(Panicking))], &[]));
+        assert!(maps.summary.starts_with("1 of 2 given maps"), "{}", maps.summary);
+        assert!(
+            maps.summary.contains("1.png: the image decoder failed"),
+            "{}",
+            maps.summary
+        );
     }
 
     #[test]

@@ -3,6 +3,7 @@
 //! Files contain them in the camera's axes, by the convention of OpenCV or of OpenGL, or in the world's axes, and do not say which. A
 //! surface that a photograph shows faces the camera: all maps of a dataset are taken to be in the axes in which most of the normals do.
 
+use crate::photos::caught;
 use crate::recipe::Param;
 use crate::schedule::StepPlan;
 use crate::trainer::Trainer;
@@ -71,7 +72,11 @@ impl NormalMaps {
 
     /// Reads the maps of the training views.
     pub fn read(dataset: &Dataset) -> Self {
-        let read = |view: &usize| Some((*view, dataset.views[*view].normal_map.as_ref()?.load()));
+        let read = |index: &usize| {
+            let view = &dataset.views[*index];
+            let source = view.normal_map.as_ref()?;
+            Some((*index, caught(&view.name, || source.load())))
+        };
         let maps: Vec<_> = dataset.train.par_iter().filter_map(read).collect();
         let given = maps.len();
         let unreadable = maps

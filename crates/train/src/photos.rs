@@ -3,6 +3,7 @@
 mod loader;
 
 use irradia_scene::{Dataset, LoadError, Photo};
+pub(crate) use loader::caught;
 use loader::{Job, Loaded, Loader};
 use std::collections::HashMap;
 use std::sync::Arc;

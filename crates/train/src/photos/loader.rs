@@ -60,20 +60,14 @@ impl Shared {
             let key = (job.view, job.scale);
             state.running.push(key);
             drop(state);
-            // A decoder's panic on a damaged file must not leave the training waiting.
-            let result = catch_unwind(AssertUnwindSafe(|| load(&self.dataset, &job, self.background)));
             let name = &self.dataset.views[job.view].name;
-            let panicked = || {
-                LoadError(format!(
-                    "{name}: the image decoder failed; copy the file again or remove it"
-                ))
-            };
+            let result = caught(name, || load(&self.dataset, &job, self.background));
             state = self.lock();
             state.running.retain(|running| *running != key);
             state.done.push(Loaded {
                 view: job.view,
                 scale: job.scale,
-                result: result.unwrap_or_else(|_| Err(panicked())),
+                result,
             });
             self.done.notify_all();
         }
@@ -143,6 +137,16 @@ impl Drop for Loader {
         state.queue.clear();
         self.0.queued.notify_all();
     }
+}
+
+/// The result of `load` for the view `name`. A decoder's panic on a damaged file is an error: it must not leave the training waiting, and
+/// not end it where the file can be done without.
+pub(crate) fn caught<T>(name: &str, load: impl FnOnce() -> Result<T, LoadError>) -> Result<T, LoadError> {
+    catch_unwind(AssertUnwindSafe(load)).unwrap_or_else(|_| {
+        Err(LoadError(format!(
+            "{name}: the image decoder failed; copy the file again or remove it"
+        )))
+    })
 }
 
 fn load(dataset: &Dataset, job: &Job, background: [f32; 3]) -> Result<(Arc<Prepared>, Option<Arc<Photo>>), LoadError> {

@@ -187,13 +187,14 @@ impl MemoryPlan {
     /// A warning, one line, if memory limits the splats of the recipe `name`.
     pub(crate) fn warning(&self, name: &str) -> Option<String> {
         let limit = self.limit.filter(|_| self.splats < self.wanted_splats)?;
-        let more = SPLAT_BYTES * (self.wanted_splats - self.splats);
+        // A recipe may have any limit, also one that means none.
+        let more = SPLAT_BYTES.saturating_mul(self.wanted_splats - self.splats);
         Some(format!(
             "{} of memory allows {} splats, but recipe {name} has up to {}: density control adds fewer; --memory {} allows all",
             in_gib(limit),
             self.splats,
             self.wanted_splats,
-            in_gib_rounded_up(limit + more)
+            in_gib_rounded_up(limit.saturating_add(more))
         ))
     }
 }
@@ -229,7 +230,7 @@ fn in_gib(bytes: usize) -> String {
 
 /// As `--memory` reads it; rounded up, so that the figure suffices.
 fn in_gib_rounded_up(bytes: usize) -> String {
-    in_gib(bytes + (1 << 30) / 100).replace(' ', "")
+    in_gib(bytes.saturating_add((1 << 30) / 100)).replace(' ', "")
 }
 
 /// Three quarters of the free memory, bytes; `None` where unknown.
@@ -329,6 +330,16 @@ mod tests {
                 .warning("fast")
                 .is_none()
         );
+    }
+
+    #[test]
+    fn a_limit_beyond_all_memory_is_not_said_to_fit_into_little() {
+        for max_splats in [usize::MAX, i64::MAX as usize] {
+            let plan = MemoryPlan::new(&needs(1000, max_splats), Some(2 * GIB)).unwrap();
+            let warning = plan.warning("classic").unwrap();
+            let figure = warning.split("--memory ").nth(1).unwrap().split("GiB").next().unwrap();
+            assert!(figure.parse::<f64>().unwrap() > 1e6, "{warning}");
+        }
     }
 
     #[test]

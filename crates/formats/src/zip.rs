@@ -6,7 +6,7 @@ use crate::bytes::ByteReader;
 use crate::unpack::inflate;
 use flate2::Crc;
 use std::borrow::Cow;
-use std::collections::HashMap;
+use std::collections::BTreeMap;
 use std::io::{self, Write};
 
 /// Signature and fixed part of the end-of-archive record, and its maximum comment length.
@@ -47,8 +47,8 @@ impl<'a> Entry<'a> {
     }
 }
 
-/// The files of the archive by name.
-pub(crate) fn files(archive: &[u8]) -> Result<HashMap<String, Entry<'_>>, Malformed> {
+/// The files of the archive, in the order of their names.
+pub(crate) fn files(archive: &[u8]) -> Result<BTreeMap<String, Entry<'_>>, Malformed> {
     let malformed = |reason: &str| Malformed(format!("not a usable zip archive: {reason}"));
     let last = archive.len().checked_sub(END_RECORD_BYTES);
     let last = last.ok_or_else(|| malformed("it is too short"))?;
@@ -61,7 +61,7 @@ pub(crate) fn files(archive: &[u8]) -> Result<HashMap<String, Entry<'_>>, Malfor
     let [count, _, start] = [u32::from(record.u16()?), record.u32()?, record.u32()?];
     let directory = archive.get(start as usize..end);
     let mut directory = ByteReader::new(directory.ok_or_else(|| malformed("its directory is beyond its end"))?);
-    let mut files = HashMap::new();
+    let mut files = BTreeMap::new();
     for _ in 0..count {
         // Signature, versions, flags; then method, time, checksum, sizes, and the lengths of name, extra field and comment.
         if directory.take(4)? != b"PK\x01\x02" {

@@ -456,14 +456,11 @@ pub fn splat_file_size(path: &Path) -> Result<u64, FormatError> {
     if SplatFormat::of(path)? != SplatFormat::SogFolder {
         return Ok(fs::metadata(path).map_err(read_error)?.len());
     }
-    let folder = sog_meta(path).with_file_name("");
-    let mut total = 0;
-    for entry in fs::read_dir(folder).map_err(read_error)? {
-        let entry = entry.map_err(read_error)?;
-        let is_part = entry.path().extension().is_some_and(|e| e == "webp") || entry.file_name() == sog::META_FILE;
-        if is_part {
-            total += entry.metadata().map_err(read_error)?.len();
-        }
+    // Other images in the folder, such as those of a scene that this one has replaced, are no part of it.
+    let meta = sog_meta(path);
+    let mut total = fs::metadata(&meta).map_err(read_error)?.len();
+    for name in read_and_parse(&meta, sog::image_names)? {
+        total += fs::metadata(meta.with_file_name(name)).map_err(read_error)?.len();
     }
     Ok(total)
 }
@@ -648,5 +645,26 @@ mod tests {
             let error = read(uri).unwrap_err().to_string();
             assert!(error.contains("not in its folder"), "{uri}: {error}");
         }
+    }
+
+    #[test]
+    fn the_size_of_a_folder_of_images_is_that_of_its_scene() {
+        let folder = tempfile::tempdir().unwrap();
+        let splats = |degree: u32| {
+            rows::decode_splats(9, degree, |i, splat| {
+                splat.mean[0] = i as f32;
+                splat.quat[0] = 1.0;
+                splat.sh.fill(0.01 * i as f32);
+            })
+        };
+        let size = |path: &Path| splat_file_size(path).unwrap();
+        let [used, new] = ["used", "new"].map(|name| folder.path().join(name).join(sog::META_FILE));
+        write_splats(&used, &splats(2)).unwrap();
+        let before = size(&used);
+        write_splats(&used, &splats(0)).unwrap();
+        write_splats(&new, &splats(0)).unwrap();
+        fs::write(used.with_file_name("preview.webp"), vec![0; 1000]).unwrap();
+        assert!(size(&used) == size(&new) && size(&new) < before);
+        assert_eq!(size(used.parent().unwrap()), size(&new));
     }
 }

@@ -17,7 +17,7 @@ fn malformed(reason: impl std::fmt::Display) -> Malformed {
 /// From the zip archive.
 pub(super) fn from_archive(bytes: &[u8], wanted: Wanted) -> Result<BTreeMap<String, Tensor>, Malformed> {
     // PyTorch compresses nothing, so that no file is larger than the archive.
-    let mut files = HashMap::new();
+    let mut files = BTreeMap::new();
     for (name, entry) in zip::files(bytes)? {
         let content = entry.stored();
         let content = content.ok_or_else(|| {

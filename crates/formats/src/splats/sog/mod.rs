@@ -12,7 +12,7 @@ mod read;
 mod write;
 
 pub use read::parse_zip as parse;
-pub(crate) use read::{MAX_META_BYTES, is_meta, read_folder};
+pub(crate) use read::{MAX_META_BYTES, image_names, is_meta, read_folder};
 pub(crate) use write::{encode, write};
 
 /// The file that describes the others.
@@ -21,3 +21,34 @@ pub(crate) const META_FILE: &str = "meta.json";
 const ENTRIES_PER_ROW: usize = 64;
 /// Fourth byte of a quaternion whose largest component is w; the values for x, y and z follow.
 const LARGEST_W: u8 = 252;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::splats::{WriteOptions, rows::decode_splats};
+    use crate::zip::Writer;
+
+    /// The files of a scene of `count` splats.
+    fn scene(count: usize) -> Vec<(&'static str, Vec<u8>)> {
+        let cloud = decode_splats(count, 0, |i, splat| {
+            splat.mean[0] = i as f32;
+            splat.quat[0] = 1.0;
+        });
+        encode(&cloud, &WriteOptions::default()).unwrap()
+    }
+
+    #[test]
+    fn of_several_scenes_in_an_archive_it_is_always_the_same() {
+        let mut archive = Vec::new();
+        let mut writer = Writer::new(&mut archive);
+        for (folder, count) in [("0_3/", 3), ("0_1/", 1), ("0_2/", 2), ("near/0_0/", 4)] {
+            for (name, content) in scene(count) {
+                writer.add_file(&format!("{folder}{name}"), &content).unwrap();
+            }
+        }
+        writer.finish().unwrap();
+        for _ in 0..40 {
+            assert_eq!(parse(&archive).unwrap().len(), 1);
+        }
+    }
+}

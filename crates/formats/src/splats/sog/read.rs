@@ -7,7 +7,7 @@ use irradia_scene::{GaussianCloud, sh};
 use rayon::prelude::*;
 use serde::Deserialize;
 use std::borrow::Cow;
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::io::Cursor;
 use std::path::Path;
 
@@ -64,7 +64,8 @@ struct Harmonics {
 /// When it is not a zip archive, an image is missing, damaged or of the wrong size, or an index is out of range.
 pub fn parse_zip(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     let files = zip::files(bytes)?;
-    // Some tools put a folder around the files.
+    // Some tools put a folder around the files. Of several scenes, such as levels of detail, the one with the shortest path is read, the first
+    // by name if there are more.
     let is_meta = |name: &&String| {
         name.strip_suffix(META_FILE)
             .is_some_and(|rest| rest.is_empty() || rest.ends_with('/'))
@@ -132,6 +133,11 @@ fn parse_meta(text: &[u8]) -> Result<Meta, Malformed> {
             "SOG version {version} is not known; expected 1 or 2"
         ))),
     }
+}
+
+/// The names of the images in the `meta.json` with this text.
+pub(crate) fn image_names(text: &[u8]) -> Result<BTreeSet<String>, Malformed> {
+    Ok(file_names(&parse_meta(text)?).cloned().collect())
 }
 
 /// Whether `text` is the `meta.json` of a scene of any version.

@@ -125,6 +125,7 @@ impl Run {
                 &trainer.recipe,
                 &journal.stages,
                 &trainer.clock,
+                trainer.skipped,
                 input.steps,
                 input.budget.is_some(),
             ),

@@ -35,6 +35,8 @@ const FORMAT_4: &str = "irradia-checkpoint-4";
 const FIELD_PREFIX: &str = "field.";
 /// The time breakdown; absent from earlier checkpoints.
 const TIMES_TENSOR: &str = "times";
+/// Recipe steps skipped before the first step; absent if none were.
+const SKIPPED_TENSOR: &str = "skipped";
 /// Views to train on; absent if no misfits were left out.
 const TRAINED_TENSOR: &str = "trained_views";
 /// View and block of each block that is hidden as transient.
@@ -88,6 +90,9 @@ impl<'a> Checkpoint<'a> {
         others.push(NamedTensor::u64s("clock.whole", &integers));
         others.push(NamedTensor::f64s("clock.real", &reals));
         others.push(NamedTensor::f64s(TIMES_TENSOR, &trainer.times.to_array()));
+        if trainer.skipped > 0.0 {
+            others.push(NamedTensor::f64s(SKIPPED_TENSOR, &[trainer.skipped]));
+        }
         if trainer.trained.len() < trainer.dataset.train.len() {
             let trained: Vec<u64> = trainer.trained.iter().map(|view| *view as u64).collect();
             others.push(NamedTensor::u64s(TRAINED_TENSOR, &trained));
@@ -327,6 +332,9 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
     if let Ok(times) = tensors.required_f64s(TIMES_TENSOR) {
         let times = times.try_into();
         trainer.times = Times::from_array(times.map_err(|_| damaged(format!("{TIMES_TENSOR} has the wrong length")))?);
+    }
+    if let Ok([skipped]) = tensors.required_f64s(SKIPPED_TENSOR).as_deref() {
+        trainer.skipped = *skipped;
     }
     trainer.clock = progress.clock;
     trainer.restore_filter();

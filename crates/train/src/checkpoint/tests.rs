@@ -231,6 +231,14 @@ fn an_unknown_parameter_is_rejected_by_name() {
 }
 
 #[test]
+fn a_resumed_run_knows_how_much_of_its_recipe_it_has_skipped() {
+    let mut trainer = trainer();
+    assert_eq!(read(&to_bytes(&trainer)).unwrap().skipped, 0.0);
+    trainer.skipped = 2400.5;
+    assert_eq!(read(&to_bytes(&trainer)).unwrap().skipped, 2400.5);
+}
+
+#[test]
 fn moments_follow_edited_splats() {
     let mut trainer = trainer();
     let state = trainer.engine.state_mut();

@@ -32,11 +32,19 @@ pub struct KnobCurve {
 /// Approximate number of samples of a run.
 const TARGET_SAMPLES: f64 = 160.0;
 
-/// The schedule of a run of `recipe` at `clock` with the stages `stages`. `steps` is the number of steps into which it was
-/// fitted, `timed` whether it was fitted into a time budget instead.
-pub fn schedule(recipe: &Recipe, stages: &[StageReport], clock: &Clock, steps: Option<u64>, timed: bool) -> Schedule {
-    let spans = spans(recipe, stages, clock, steps, timed);
+/// The schedule of a run of `recipe` at `clock` with the stages `stages`, which began after the first `skipped` recipe steps. `steps` is the
+/// number of steps into which the others were fitted, `timed` whether they were fitted into a time budget instead.
+pub fn schedule(
+    recipe: &Recipe,
+    stages: &[StageReport],
+    clock: &Clock,
+    skipped: f64,
+    steps: Option<u64>,
+    timed: bool,
+) -> Schedule {
+    let spans = spans(recipe, stages, clock, skipped, steps, timed);
     let mut run = Clock::new(recipe);
+    run.advance(recipe, skipped);
     let mut quiet = recipe.clone();
     quiet.stage.iter_mut().for_each(|stage| stage.exit = None);
     let total: f64 = spans.iter().map(|span| span.lasted).sum();
@@ -49,8 +57,8 @@ pub fn schedule(recipe: &Recipe, stages: &[StageReport], clock: &Clock, steps: O
         measured: None,
         views: 1,
     };
-    for (i, span) in spans.iter().enumerate() {
-        let full = recipe.stage[i].steps as f64;
+    for span in &spans {
+        let (i, full) = (span.stage, recipe.stage[span.stage].steps as f64 - span.skipped);
         let parts = (TARGET_SAMPLES * span.lasted / total.max(1.0))
             .ceil()
             .clamp(1.0, TARGET_SAMPLES) as usize;
@@ -85,6 +93,10 @@ pub fn schedule(recipe: &Recipe, stages: &[StageReport], clock: &Clock, steps: O
 
 /// The extent of a stage in a run.
 struct Span {
+    /// The stage.
+    stage: usize,
+    /// Recipe steps skipped at its start.
+    skipped: f64,
     /// Steps completed at its start.
     entered: u64,
     /// Steps made in it.
@@ -96,11 +108,24 @@ struct Span {
 }
 
 /// The spans of the stages that the run has entered.
-fn spans(recipe: &Recipe, stages: &[StageReport], clock: &Clock, steps: Option<u64>, timed: bool) -> Vec<Span> {
+fn spans(
+    recipe: &Recipe,
+    stages: &[StageReport],
+    clock: &Clock,
+    skipped: f64,
+    steps: Option<u64>,
+    timed: bool,
+) -> Vec<Span> {
     let total = recipe.total_steps() as f64;
-    let (mut spans, mut entered, mut time) = (Vec::new(), 0, 0.0);
+    let (mut spans, mut entered, mut start) = (Vec::new(), 0, 0.0);
     for (i, stage) in recipe.stage.iter().enumerate().take(clock.stage + 1) {
-        let full = stage.steps as f64;
+        // What the run skipped before its first step is no part of the span.
+        let time = skipped.clamp(start, start + stage.steps as f64);
+        let full = start + stage.steps as f64 - time;
+        if full <= 0.0 {
+            start = time;
+            continue;
+        }
         // A stage shorter than a step was never entered.
         let report = stages.iter().find(|report| report.name == stage.name);
         let end = report.map_or(entered, |report| report.last_step.max(entered));
@@ -109,7 +134,7 @@ fn spans(recipe: &Recipe, stages: &[StageReport], clock: &Clock, steps: Option<u
             (total - time) / steps.saturating_sub(entered).max(1) as f64
         });
         let (lasted, known) = if i == clock.stage {
-            (clock.time - clock.stage_time, true)
+            (clock.time - clock.stage_time - (time - start), true)
         } else if stage.exit.is_none() {
             (full, true)
         } else if timed {
@@ -121,12 +146,14 @@ fn spans(recipe: &Recipe, stages: &[StageReport], clock: &Clock, steps: Option<u
             (if whole { full } else { lasted }, true)
         };
         spans.push(Span {
+            stage: i,
+            skipped: time - start,
             entered,
             steps: made,
             lasted: lasted.clamp(0.0, full),
             known,
         });
-        (entered, time) = (end, time + full);
+        (entered, start) = (end, time + full);
     }
     if spans.last().is_some_and(|span| span.lasted <= 0.0) {
         spans.pop();
@@ -210,7 +237,7 @@ mod tests {
             stage("grow", 51, 100),
             stage("refine", 101, 200),
         ];
-        let schedule = schedule(&recipe, &stages, &ended(&recipe), Some(200), false);
+        let schedule = schedule(&recipe, &stages, &ended(&recipe), 0.0, Some(200), false);
         assert!(schedule.done && schedule.steps.windows(2).all(|w| w[0] <= w[1]));
         assert_eq!(schedule.steps.last(), Some(&200.0));
         assert!((at(&schedule, "rate.means", 100.0) - 2.0).abs() < 1e-3);
@@ -253,7 +280,7 @@ mod tests {
             stage("grow", 41, 140),
             stage("refine", 141, 340),
         ];
-        let schedule = schedule(&recipe, &stages, &clock, None, false);
+        let schedule = schedule(&recipe, &stages, &clock, 0.0, None, false);
         assert!(schedule.done);
         for (step, name, of) in [
             (20.0, "scale.image", truth[20].image_scale),
@@ -281,15 +308,35 @@ mod tests {
             ..Clock::new(&recipe)
         };
         let stages = [stage("warmup", 1, 100), stage("grow", 101, 150)];
-        let half = schedule(&recipe, &stages, &clock, None, false);
+        let half = schedule(&recipe, &stages, &clock, 0.0, None, false);
         assert!(half.done && half.steps.last() == Some(&150.0));
-        assert!(!schedule(&recipe, &stages, &clock, None, true).done);
+        assert!(!schedule(&recipe, &stages, &clock, 0.0, None, true).done);
         assert_eq!(
-            schedule(&recipe, &[], &Clock::new(&recipe), None, false),
+            schedule(&recipe, &[], &Clock::new(&recipe), 0.0, None, false),
             Schedule {
                 done: true,
                 ..Schedule::default()
             }
         );
+    }
+
+    #[test]
+    fn a_run_that_skips_the_beginning_shows_what_it_did() {
+        // 75 steps for the last 150 of 400: the first stage and a half are skipped.
+        let recipe = recipe("");
+        for (skipped, first_rate, stages) in [
+            (250.0, 1.5, vec![stage("refine", 1, 75)]),
+            (150.0, 2.5, vec![stage("grow", 1, 15), stage("refine", 16, 75)]),
+        ] {
+            let schedule = schedule(&recipe, &stages, &ended(&recipe), skipped, Some(75), false);
+            let rates = schedule.knobs.iter().find(|knob| knob.name == "rate.means").unwrap();
+            assert!(schedule.done && schedule.steps.windows(2).all(|w| w[0] <= w[1]));
+            for (step, value) in schedule.steps.iter().zip(&rates.values) {
+                // Proportional to the steps that are left.
+                let expected = first_rate * (1.0 - step / 75.0);
+                assert!((value - expected).abs() < 0.02, "{value}, not {expected}, at {step}");
+            }
+            assert_eq!([schedule.steps[0], *schedule.steps.last().unwrap()], [0.0, 75.0]);
+        }
     }
 }

@@ -4,7 +4,7 @@ use crate::is_film_name;
 use irradia_formats::is_image_name;
 use irradia_scene::{Dataset, Lens};
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 use std::path::{Path, PathBuf};
 use std::{fs, io};
 
@@ -50,8 +50,10 @@ impl ViewList {
         let train = views()
             .filter(|view| !matches!(part(*view), Some(SplitPart::Test | SplitPart::Neither)))
             .collect();
-        let held_out = self.0.values().filter(|record| record.part == SplitPart::Test).count();
-        let missing = held_out - test.len();
+        let found: HashSet<&str> = test.iter().map(|view| dataset.views[*view].name.as_str()).collect();
+        let is_missing =
+            |(name, record): &(&String, &ViewRecord)| record.part == SplitPart::Test && !found.contains(name.as_str());
+        let missing = self.0.iter().filter(is_missing).count();
         (dataset.train, dataset.test) = (train, test);
         Some(missing)
     }
@@ -242,6 +244,20 @@ mod tests {
             fs::write(data.path().join(file), "x").unwrap();
         }
         assert_eq!(known.last(), Some(&fingerprint()));
+    }
+
+    #[test]
+    fn held_out_views_are_missing_by_name_however_many_have_that_name() {
+        let mut then = data();
+        (then.train, then.test) = (vec![0, 1], vec![2, 3]);
+        let list = ViewList::of(&then);
+        // Two photographs of the name of one that was held out, and none of the other's.
+        let mut now = data();
+        let name = now.views[2].name.clone();
+        now.views[3].name.clone_from(&name);
+        now.views[1].name = name;
+        assert_eq!(list.split(&mut now), Some(1));
+        assert_eq!((now.train, now.test), (vec![0], vec![1, 2, 3]));
     }
 
     fn data() -> Dataset {

@@ -142,6 +142,31 @@ fn list() -> Vec<(wgpu::Adapter, AdapterInfo)> {
     list
 }
 
+/// The first adapter of the wanted kind that is usable; `list` has graphics cards first.
+fn chosen<A>(list: Vec<(A, AdapterInfo)>, wanted: &Wanted) -> Result<(A, AdapterInfo), DeviceError> {
+    let is_wanted = |info: &AdapterInfo| match wanted {
+        Wanted::Real => info.kind != AdapterKind::Software,
+        Wanted::Any => true,
+        Wanted::Named(name) => info.name.to_lowercase().contains(&name.to_lowercase()),
+    };
+    let found = list.into_iter().filter(|(_, info)| is_wanted(info));
+    let (usable, others): (Vec<_>, Vec<_>) = found.partition(|(_, info)| info.is_usable);
+    if let Some(first) = usable.into_iter().next() {
+        return Ok(first);
+    }
+    Err(match (wanted, others.into_iter().next()) {
+        (Wanted::Named(_), Some((_, info))) => DeviceError::Refused {
+            name: info.name,
+            reason: "its kernels have too few bindings, threads or bytes of shared memory".to_owned(),
+        },
+        (Wanted::Named(name), None) => DeviceError::None(format!("is called {name:?}")),
+        (Wanted::Real, _) => DeviceError::None("was found".to_owned()),
+        (Wanted::Any, _) => {
+            DeviceError::None("was found; Mesa's software Vulkan would do (mesa-vulkan-drivers)".to_owned())
+        }
+    })
+}
+
 fn describe(adapter: &wgpu::Adapter) -> AdapterInfo {
     let (info, limits) = (adapter.get_info(), adapter.limits());
     let has_subgroups = adapter.features().contains(wgpu::Features::SUBGROUP);
@@ -186,21 +211,7 @@ impl Gpu {
     }
 
     fn open_here(wanted: &Wanted) -> Result<Arc<Self>, DeviceError> {
-        let is_wanted = |info: &AdapterInfo| match wanted {
-            Wanted::Real => info.is_usable && info.kind != AdapterKind::Software,
-            Wanted::Any => info.is_usable,
-            Wanted::Named(name) => info.name.to_lowercase().contains(&name.to_lowercase()),
-        };
-        let mut found: Vec<_> = list().into_iter().filter(|(_, info)| is_wanted(info)).collect();
-        // Among several of the same name, a usable one comes first.
-        found.sort_by_key(|(_, info)| !info.is_usable);
-        let Some((adapter, info)) = found.into_iter().next() else {
-            return Err(DeviceError::None(match wanted {
-                Wanted::Real => "was found".to_owned(),
-                Wanted::Any => "was found; Mesa's software Vulkan would do (mesa-vulkan-drivers)".to_owned(),
-                Wanted::Named(name) => format!("is called {name:?}"),
-            }));
-        };
+        let (adapter, info) = chosen(list(), wanted)?;
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("irradia"),
             required_features: adapter.features() & wgpu::Features::TIMESTAMP_QUERY,

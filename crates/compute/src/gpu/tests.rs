@@ -6,6 +6,37 @@ fn gpu() -> Option<Arc<Gpu>> {
 }
 
 #[test]
+fn an_adapter_that_cannot_be_used_is_not_opened_by_its_name() {
+    let adapter = |name: &str, kind: AdapterKind, is_usable: bool| {
+        let info = AdapterInfo {
+            name: name.to_owned(),
+            kind,
+            api: "Vulkan".to_owned(),
+            driver: String::new(),
+            largest_array: 1 << 30,
+            shared_memory: 32 << 10,
+            subgroup: [32; 2],
+            is_usable,
+        };
+        ((), info)
+    };
+    let old = || adapter("Old Card", AdapterKind::Discrete, false);
+    let new = || adapter("New Card", AdapterKind::Integrated, true);
+    let software = || adapter("llvmpipe", AdapterKind::Software, true);
+    let named = |name: &str| Wanted::Named(name.to_owned());
+    let name = |list: Vec<((), AdapterInfo)>, wanted: &Wanted| chosen(list, wanted).map(|(_, info)| info.name);
+    let refused = name(vec![old(), new()], &named("old")).unwrap_err().to_string();
+    assert!(refused.starts_with("the GPU Old Card cannot be used: "), "{refused}");
+    assert_eq!(name(vec![old(), new()], &named("card")).unwrap(), "New Card");
+    assert_eq!(name(vec![old(), new(), software()], &Wanted::Any).unwrap(), "New Card");
+    assert_eq!(name(vec![old(), software()], &Wanted::Any).unwrap(), "llvmpipe");
+    let none = name(vec![old(), software()], &Wanted::Real).unwrap_err().to_string();
+    assert!(none.starts_with("no GPU was found"), "{none}");
+    let none = name(vec![new()], &named("old")).unwrap_err().to_string();
+    assert!(none.starts_with("no GPU is called"), "{none}");
+}
+
+#[test]
 fn every_shader_is_valid() {
     use crate::shaders::{SCAN, SORT, SORT_SIZES};
     for shader in SCAN.iter().chain(&SORT).chain([&SORT_SIZES]) {

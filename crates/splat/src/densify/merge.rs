@@ -37,7 +37,8 @@ fn mean(state: &SplatState, i: usize) -> Vec3 {
 
 fn pairs(state: &SplatState, options: &MergeOptions) -> Vec<(u32, u32)> {
     let splats = &state.splats;
-    let whole = indices(state.len(), |i| is_finite(splats, i));
+    // A union of splats without a mass would have no place.
+    let whole = indices(state.len(), |i| is_finite(splats, i) && mass(state, i).is_normal());
     if whole.len() < 2 {
         return Vec::new();
     }
@@ -95,10 +96,17 @@ struct Union {
     opacity_logit: f32,
 }
 
+/// The product of the standard deviations.
+fn volume(log_scales: [f32; 3]) -> f32 {
+    log_scales.into_iter().sum::<f32>().exp()
+}
+
+fn mass(state: &SplatState, i: usize) -> f32 {
+    state.splats.opacity(i) * volume(std::array::from_fn(|c| state.splats.log_scales.get(c, i)))
+}
+
 fn union(state: &SplatState, a: usize, b: usize) -> Union {
-    let volume = |log_scales: [f32; 3]| log_scales.into_iter().sum::<f32>().exp();
-    let own_volume = |i: usize| volume(std::array::from_fn(|c| state.splats.log_scales.get(c, i)));
-    let masses = [a, b].map(|i| state.splats.opacity(i) * own_volume(i));
+    let masses = [a, b].map(|i| mass(state, i));
     let total = (masses[0] + masses[1]).max(f32::MIN_POSITIVE);
     let fractions = masses.map(|m| m / total);
     let (ma, mb) = (mean(state, a), mean(state, b));
@@ -202,5 +210,28 @@ mod tests {
         let one = (0..2).find(|i| mean(&state, *i).x < 5.0).unwrap();
         assert!(mean(&state, one).distance(center) < 1e-5);
         assert!((mass(&state, one) / total - 1.0).abs() < 1e-3);
+    }
+
+    #[test]
+    fn splats_too_small_to_have_a_mass_stay_where_they_are() {
+        let place = Vec3::new(1.0, 2.0, 3.0);
+        for (size, pruned) in [
+            (Vec3::splat(1e-13), 0),
+            (Vec3::new(1e-3, 1e-3, 1e-35), 0),
+            (Vec3::splat(1e-6), 1),
+        ] {
+            let mut splats = Splats::zeros(2, 0);
+            (0..2).for_each(|i| splat(&mut splats, i, place, Quat::IDENTITY, size, 0.3, 0.1));
+            let mut state = SplatState::new(splats);
+            let options = MergeOptions {
+                distance: 1.0,
+                color: 0.1,
+            };
+            assert_eq!(merge(&mut state, &options).pruned, pruned, "{size}");
+            for i in 0..state.len() {
+                assert!(mean(&state, i).distance(place) < 1e-5, "{size}: {}", mean(&state, i));
+                assert!(state.splats.opacity(i) > 0.29, "{size}");
+            }
+        }
     }
 }

@@ -152,7 +152,7 @@ impl Trainer {
     /// Puts the recipe's parameters into effect for the conditions that the data meet. They are changed in the recipe, so that a resumed
     /// run has the same values.
     pub(crate) fn apply_data_conditions(&mut self) -> Result<(), TrainError> {
-        let [large, skies, known_space, cut_out] = [
+        let [large, mut skies, known_space, cut_out] = [
             std::mem::take(&mut self.recipe.large),
             std::mem::take(&mut self.recipe.skies),
             std::mem::take(&mut self.recipe.known_space),
@@ -192,6 +192,8 @@ impl Trainer {
             None
         };
         if !are_cut_out && skies_differ(&sky_colors, upright) {
+            // What is known about the space takes precedence.
+            skies.retain(|param, _| known.is_none() || !known_space.contains_key(param));
             self.apply_params("the sky differs from photograph to photograph", "skies", skies);
         }
         if let Some(why) = known {
@@ -562,6 +564,36 @@ pub(crate) mod tests {
         let dark = [[0.02, 0.03, 0.06], [0.06, 0.03, 0.03], [0.03, 0.06, 0.03]];
         assert!(!skies_differ(&dark, 3), "hues of what is nearly black");
         assert!(!skies_differ(&[], 0));
+    }
+
+    #[test]
+    fn a_parameter_is_said_to_be_as_in_the_table_that_prevails() {
+        let mut data = (*dataset(3, true)).clone();
+        let days = [[50, 100, 230], [128; 3], [230, 230, 215], [25, 75, 150]];
+        let view = |(i, color): (usize, [u8; 3])| {
+            let mut view = data.views[0].clone();
+            let eye = Vec3::new(0.3 * i as f32, 0.0, -1.0);
+            view.camera.pose = Pose::look_at(eye, Vec3::ZERO, Vec3::NEG_Y);
+            view.photo = Arc::new(Photo {
+                width: 8,
+                height: 8,
+                channels: 3,
+                data: color.repeat(64),
+                mask: None,
+            });
+            view
+        };
+        data.views = days.into_iter().enumerate().map(view).collect();
+        data.train = (0..4).collect();
+        let recipe = Recipe::parse("fast", Recipe::built_in("fast").unwrap(), &[]).unwrap();
+        let prevails = recipe.known_space[&Param::OpacityReg].clone();
+        let trainer = Trainer::new(Arc::new(data), recipe, TrainOptions::default()).unwrap();
+        assert_eq!(trainer.recipe.params[&Param::OpacityReg], prevails);
+        let says = |table: &str| {
+            let line = trainer.decisions.iter().find(|line| line.contains(table));
+            line.expect("the table takes effect").contains("opacity_reg")
+        };
+        assert_eq!([says("[skies]"), says("[known_space]")], [false, true]);
     }
 
     #[test]

@@ -153,6 +153,11 @@ impl SplatFormat {
         }
     }
 
+    /// The largest coordinate of a position that the format holds, if it is one that a scene may exceed.
+    fn max_coordinate(self) -> Option<f32> {
+        matches!(self, Self::Spz | Self::GlbSpz).then_some(spz::MAX_COORDINATE)
+    }
+
     /// Whether the format records that a scene was trained with the Mip-Splatting filters.
     fn holds_antialiased(self) -> bool {
         matches!(self, Self::Ply | Self::Spz | Self::GlbSpz | Self::Sog | Self::SogFolder)
@@ -507,6 +512,17 @@ pub fn write_splats_with(
         let names: Vec<&str> = cloud.extra.iter().map(|column| column.name.as_str()).collect();
         notes.push(format!("properties that only PLY keeps: {}", names.join(", ")));
     }
+    if let Some(limit) = format.max_coordinate() {
+        let is_beyond = |mean: &&[f32; 3]| mean.iter().any(|value| value.abs() > limit);
+        let beyond = cloud.means.iter().filter(is_beyond).count();
+        if beyond > 0 {
+            notes.push(format!(
+                "{beyond} of {} splats are farther from the origin than the {limit} units that SPZ holds, and are moved to that \
+                 distance",
+                cloud.len()
+            ));
+        }
+    }
     if cloud.antialiased && !format.holds_antialiased() {
         notes.push(format!(
             "{format} cannot record that the scene was trained with antialiasing"
@@ -666,5 +682,30 @@ mod tests {
         fs::write(used.with_file_name("preview.webp"), vec![0; 1000]).unwrap();
         assert!(size(&used) == size(&new) && size(&new) < before);
         assert_eq!(size(used.parent().unwrap()), size(&new));
+    }
+
+    #[test]
+    fn positions_beyond_the_range_of_a_format_are_reported() {
+        let folder = tempfile::tempdir().unwrap();
+        let notes = |suffix: &str, x: f32| {
+            let cloud = rows::decode_splats(3, 0, |i, splat| {
+                splat.mean[0] = if i == 1 { x } else { 1.0 };
+                splat.quat[0] = 1.0;
+            });
+            write_splats_with(
+                &folder.path().join(format!("a{suffix}")),
+                &cloud,
+                &WriteOptions::default(),
+            )
+            .unwrap()
+        };
+        for suffix in [".spz", ".spz.glb"] {
+            assert_eq!(notes(suffix, 8e6), Vec::<String>::new());
+            assert!(
+                notes(suffix, -1e7)[0].starts_with("1 of 3 splats are farther"),
+                "{suffix}"
+            );
+        }
+        assert_eq!(notes(".ply", 1e7), Vec::<String>::new());
     }
 }

@@ -98,7 +98,7 @@ fn arrays(cloud: &GaussianCloud, header: &Header, quality: Quality) -> [Vec<u8>;
     [
         array(0, &|i, row| {
             for (to, value) in row.chunks_exact_mut(3).zip(signs.position(cloud.means[i])) {
-                let fixed = (value * steps).round().clamp(-8_388_608.0, 8_388_607.0) as i32;
+                let fixed = (value * steps).round().clamp(-MAX_COORDINATE - 1.0, MAX_COORDINATE) as i32;
                 to.copy_from_slice(&fixed.to_le_bytes()[..3]);
             }
         }),

@@ -32,8 +32,8 @@ pub struct KnobCurve {
 /// Approximate number of samples of a run.
 const TARGET_SAMPLES: f64 = 160.0;
 
-/// The schedule of a run of `recipe` at `clock` with the stages `stages`, which began after the first `skipped` recipe steps. `steps` is the
-/// number of steps into which the others were fitted, `timed` whether they were fitted into a time budget instead.
+/// The schedule of a run of `recipe` at `clock` with the stages `stages`, which began after the first `skipped` recipe steps. `steps` is
+/// the number of steps into which the others were fitted, `timed` whether they were fitted into a time budget instead.
 pub fn schedule(
     recipe: &Recipe,
     stages: &[StageReport],

@@ -64,8 +64,8 @@ struct Harmonics {
 /// When it is not a zip archive, an image is missing, damaged or of the wrong size, or an index is out of range.
 pub fn parse_zip(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     let files = zip::files(bytes)?;
-    // Some tools put a folder around the files. Of several scenes, such as levels of detail, the one with the shortest path is read, the first
-    // by name if there are more.
+    // Some tools put a folder around the files. Of several scenes, such as levels of detail, the one with the shortest path is read, the
+    // first by name if there are more.
     let is_meta = |name: &&String| {
         name.strip_suffix(META_FILE)
             .is_some_and(|rest| rest.is_empty() || rest.ends_with('/'))

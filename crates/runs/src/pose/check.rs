@@ -8,8 +8,8 @@ use super::view_features::{ViewFeatures, pose};
 use irradia_scene::{Dataset, View};
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::map::{
-    MIN_MISSING_PAIRS, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, VerifiedPair, agreement, contradictions,
-    evidence_pairs, folded_pairs, missing_matches, strengths, verify,
+    MIN_MISSING_PAIRS, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, VerifiedPair, agreement, contradicted_pairs,
+    contradictions, evidence_pairs, folded_pairs, missing_matches, strengths, verify,
 };
 use irradia_sfm::matching::{MatchOptions, PairOptions, candidate_pairs, match_pairs};
 use rayon::prelude::*;
@@ -32,10 +32,10 @@ const MIN_CONTRADICTING_SHARE: f64 = 0.1;
 /// How well matches between photographs agree with their poses.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PoseCheck {
-    /// Number of pairs that count as evidence: those of adjacent photographs with enough matches, and those across folds.
+    /// Number of pairs that count as evidence: those of adjacent photographs with enough matches, and others that contradict the poses.
     pub pairs: usize,
-    /// Names of the pairs whose matches contradict their poses: adjacent ones, those with the most matches first, then weaker ones across
-    /// folds.
+    /// Names of the pairs whose matches contradict their poses: adjacent ones, those with the most matches first; then weaker ones across
+    /// folds; then, if that is most of them, those of other rotations.
     pub contradicting: Vec<[String; 2]>,
     /// Contradicting pairs whose photographs both agree with others: the poses jump there.
     pub jumps: Vec<[String; 2]>,
@@ -89,15 +89,19 @@ pub fn check_poses(dataset: &Dataset) -> PoseCheck {
     let agreement = agreement(&photos, &features, &pairs, &model);
     let supported = find_supported(photos.len(), &pairs, &strengths, &agreement);
     let names = |pair: [u32; 2]| pair.map(|photo| photos[photo as usize].name.clone());
-    let evidence: BTreeSet<usize> = evidence_pairs(&pairs, &strengths).collect();
-    let mut across = folded_pairs(photos.len(), &pairs, &strengths, &agreement);
-    across.retain(|i| !evidence.contains(i));
     let mut contradicting = contradictions(&pairs, &strengths, &agreement);
-    contradicting.extend(&across);
+    let mut counted: BTreeSet<usize> = evidence_pairs(&pairs, &strengths).collect();
+    let folded = folded_pairs(photos.len(), &pairs, &strengths, &agreement);
+    for i in folded.into_iter().chain(contradicted_pairs(&pairs, &model.poses)) {
+        if !contradicting.contains(&i) {
+            contradicting.push(i);
+        }
+    }
+    counted.extend(&contradicting);
     let contradicting: Vec<[u32; 2]> = contradicting.into_iter().map(|i| pairs[i].photos).collect();
     let jump = |photos: &&[u32; 2]| photos.iter().all(|photo| supported[*photo as usize]);
     PoseCheck {
-        pairs: evidence.len() + across.len(),
+        pairs: counted.len(),
         jumps: contradicting.iter().filter(jump).copied().map(names).collect(),
         contradicting: contradicting.into_iter().map(names).collect(),
         absent: if absent.len() >= MIN_MISSING_PAIRS {

@@ -1,6 +1,7 @@
 //! Growing a model from a seed, photograph by photograph.
 
 use super::Input;
+use super::contradicted::contradicted_pairs;
 use super::focal::{FocalSource, are_similar};
 use super::model::GrowingModel;
 use super::refine::Extent;
@@ -44,7 +45,8 @@ const MAX_FINAL_ROUNDS: usize = 3;
 /// The search ends with a seed whose model has more than half of the photographs it could reach. Two photographs with wrong focal lengths
 /// may lead to a wrong model of all photographs, which explains a third of their observations instead of nine tenths: where focal lengths
 /// are guessed, or end far from where they began, the model must explain most observations as well. So must a model of few photographs: a
-/// seed with wrong poses hardly finds others that disagree. The failures of the best seed are added to `failed_registrations`.
+/// seed with wrong poses hardly finds others that disagree. A model that most of its pairs contradict never suffices: two motions fit a
+/// plane, and from the wrong one a model grows that fits the ground and nothing above it. The failures of the best seed are added to `failed_registrations`.
 pub(super) fn grow_model<'a>(
     input: &Input<'a>,
     pairs: &[VerifiedPair],
@@ -62,8 +64,10 @@ pub(super) fn grow_model<'a>(
     let empty = GrowingModel::new(photos, cameras, tracks, options);
     let guessed_focals = empty.has_guessed_focals();
     let few = photos.len() <= FEW_PHOTOS;
+    let is_contradicted = |model: &GrowingModel| !contradicted_pairs(pairs, &model.poses).is_empty();
     // Whether the model must also explain enough observations.
-    let is_doubtful = |model: &GrowingModel| guessed_focals || few || model.is_far_from_initial_focals();
+    let is_doubtful =
+        |model: &GrowingModel| guessed_focals || few || model.is_far_from_initial_focals() || is_contradicted(model);
     let mut is_any_doubtful = guessed_focals || few;
     let mut best: Option<GrowingModel> = None;
     let mut outcomes: Vec<SeedOutcome> = Vec::new();
@@ -119,6 +123,7 @@ pub(super) fn grow_model<'a>(
         }
         let is_sufficient = |best: &GrowingModel| {
             2 * best.registered() > reachable
+                && !is_contradicted(best)
                 && (!is_doubtful(best) || best.explained_fraction() > MIN_EXPLAINED_FRACTION)
         };
         if best.as_ref().is_some_and(is_sufficient) {

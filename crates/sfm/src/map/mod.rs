@@ -5,6 +5,7 @@
 //! The result depends only on the input, not on clocks, threads or hash order.
 
 mod agreement;
+mod contradicted;
 mod covering;
 mod distance;
 mod finish;
@@ -13,6 +14,7 @@ mod focal;
 mod fold;
 mod grow;
 mod guide;
+mod loops;
 mod metric;
 mod missing;
 mod model;
@@ -33,10 +35,12 @@ mod zoom;
 
 pub(crate) use agreement::normalized_matches;
 pub use agreement::{agreement, contradictions, evidence_pairs, strengths};
+pub use contradicted::contradicted_pairs;
 pub use distance::{Distance, DistanceFit, scale_to_distances};
 pub use focal::FocalSource;
 pub use fold::folded_pairs;
 pub use guide::add_guided_points;
+pub(crate) use loops::closed_loop_fractions;
 pub use metric::{ScaleFit, scale_to_locations};
 pub use missing::{MIN_MISSING_PAIRS, missing_matches};
 pub use observable::determines_focal;

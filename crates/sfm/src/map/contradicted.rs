@@ -1,0 +1,71 @@
+//! Models that fit the points of a plane with another motion than the cameras': what stands on the plane contradicts them.
+
+use super::types::{PairKind, VerifiedPair};
+use crate::geometry::pose::DPose;
+
+/// Maximum angle between the rotation of a pair that shows depth and that of its photographs in a model that agrees with it, radians, and
+/// minimum number of such pairs, with their minimum number of matches, for a judgement. Of a film by a drone above a town, a model with
+/// another motion that also fits the ground explains 0.75 of its observations and agrees with 2 % of these pairs, the correct one with 97 %.
+const MAX_ROTATION_ERROR: f64 = 0.087;
+const MIN_JUDGED_PAIRS: usize = 10;
+const MIN_JUDGED_MATCHES: usize = 30;
+
+/// If most of the `pairs` that show depth, and whose photographs both have `poses`, have other rotations than these: the indices of those
+/// that do.
+pub fn contradicted_pairs(pairs: &[VerifiedPair], poses: &[Option<DPose>]) -> Vec<usize> {
+    let agrees = |pair: &VerifiedPair| {
+        let [a, b] = pair.photos.map(|photo| poses[photo as usize]);
+        let rotation = b?.rotation.inverse() * a?.rotation;
+        Some(rotation.angle_between(pair.motion.rotation) < MAX_ROTATION_ERROR)
+    };
+    let judged = pairs
+        .iter()
+        .enumerate()
+        .filter(|(_, pair)| pair.kind == PairKind::General && pair.matches.len() >= MIN_JUDGED_MATCHES);
+    let (agreeing, contradicted): (Vec<_>, Vec<_>) = judged
+        .filter_map(|(i, pair)| Some((i, agrees(pair)?)))
+        .partition(|(_, agrees)| *agrees);
+    let is_judged = agreeing.len() + contradicted.len() >= MIN_JUDGED_PAIRS;
+    if is_judged && contradicted.len() > agreeing.len() {
+        contradicted.into_iter().map(|(i, _)| i).collect()
+    } else {
+        Vec::new()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::essential::Motion;
+    use glam::{DQuat, DVec3};
+
+    #[test]
+    fn a_model_with_other_rotations_than_most_pairs_with_depth_is_contradicted() {
+        let turned = |i: u32, by: f64| DQuat::from_rotation_y(by * f64::from(i));
+        let pose = |i| DPose::from_camera_from_world(turned(i, 0.1), DVec3::X);
+        let poses: Vec<Option<DPose>> = (0..20).map(|i| (i < 18).then(|| pose(i))).collect();
+        let pair = |i: u32, kind: PairKind, by: f64| VerifiedPair {
+            photos: [i, i + 1],
+            matches: vec![[0, 0]; MIN_JUDGED_MATCHES],
+            kind,
+            motion: Motion {
+                rotation: turned(1, by),
+                translation: DVec3::X,
+            },
+            angle: 0.1,
+        };
+        let contradicted = |pairs: &[VerifiedPair]| contradicted_pairs(pairs, &poses).len();
+        let pairs = |wrong: u32, kind: PairKind| -> Vec<VerifiedPair> {
+            (0..19)
+                .map(|i| pair(i, kind, if i < wrong { 0.3 } else { 0.1 }))
+                .collect()
+        };
+        assert_eq!(contradicted(&pairs(8, PairKind::General)), 0);
+        assert!(
+            is_contradicted(&pairs(9, PairKind::General), &poses),
+            "9 of 17 with poses"
+        );
+        assert!(contradicted(&pairs(19, PairKind::Planar)) == 0, "planes say little");
+        assert!(contradicted(&pairs(9, PairKind::General)[..9]) == 0, "too few");
+    }
+}

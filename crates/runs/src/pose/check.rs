@@ -91,7 +91,7 @@ pub fn check_poses(dataset: &Dataset) -> PoseCheck {
     let names = |pair: [u32; 2]| pair.map(|photo| photos[photo as usize].name.clone());
     let mut contradicting = contradictions(&pairs, &strengths, &agreement);
     let mut counted: BTreeSet<usize> = evidence_pairs(&pairs, &strengths).collect();
-    let folded = folded_pairs(photos.len(), &pairs, &strengths, &agreement);
+    let folded = folded_pairs(&model.poses, &pairs, &strengths, &agreement);
     for i in folded.into_iter().chain(contradicted_pairs(&pairs, &model.poses)) {
         if !contradicting.contains(&i) {
             contradicting.push(i);

@@ -1,24 +1,32 @@
 //! Folds that only weak pairs reveal: a group of photographs that agree with one another, but not with the rest.
 
 use super::agreement::{MIN_CONSISTENT_FRACTION, evidence_pairs};
+use super::loops::MAX_LOOP_ERROR_RADIANS;
 use super::types::VerifiedPair;
+use crate::geometry::pose::DPose;
+use glam::DQuat;
 use std::cmp::Reverse;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// A pair agrees with the model if more than this fraction of its matches do.
 const MIN_AGREEING_FRACTION: f64 = 0.5;
-/// Minimum number of pairs between two groups that contradict the model: fewer may be of parts of the scene that look alike.
-const MIN_FOLDED_PAIRS: usize = 3;
-/// Minimum number of photographs of a group: a single one is wrong by itself.
-const MIN_GROUP: usize = 2;
+/// Minimum number of photographs of each group in pairs that turn it alike: a single photograph is wrong by itself, and a few weak pairs
+/// may be of parts of the scene that look alike.
+const MIN_FOLDED_PHOTOS: usize = 3;
 
 /// Indices of the pairs, strong or weak, across folds. Photographs are one group if neighbours agree, and groups are joined while more of
-/// the pairs between them agree with the model than contradict it; `strengths` and `agreement` are `[pairs]`. What contradicts the model
-/// between the groups that remain is across a fold, no matter how few matches a pair has: nothing else connects the groups.
-pub fn folded_pairs(photos: usize, pairs: &[VerifiedPair], strengths: &[f64], agreement: &[Option<f64>]) -> Vec<usize> {
+/// the pairs between them agree with the model than contradict it; `strengths` and `agreement` are `[pairs]`. Nothing else connects the
+/// groups that remain. If pairs between two of them say that one is turned relative to the other, all by the same rotation, the model is
+/// folded, no matter how few matches a pair has; wrong matches say different rotations.
+pub fn folded_pairs(
+    poses: &[Option<DPose>],
+    pairs: &[VerifiedPair],
+    strengths: &[f64],
+    agreement: &[Option<f64>],
+) -> Vec<usize> {
     let agrees = |i: usize| agreement[i].is_some_and(|fraction| fraction > MIN_AGREEING_FRACTION);
     let contradicts = |i: usize| agreement[i].is_some_and(|fraction| fraction < MIN_CONSISTENT_FRACTION);
-    let mut group: Vec<usize> = (0..photos).collect();
+    let mut group: Vec<usize> = (0..poses.len()).collect();
     let ends = |group: &[usize], i: usize| {
         let [a, b] = pairs[i].photos.map(|photo| group[photo as usize]);
         [a.min(b), a.max(b)]
@@ -41,22 +49,50 @@ pub fn folded_pairs(photos: usize, pairs: &[VerifiedPair], strengths: &[f64], ag
         };
         join(&mut group, joined);
     }
-    let mut sizes = vec![0; photos];
-    group.iter().for_each(|of| sizes[*of] += 1);
-    let mut between: BTreeMap<[usize; 2], Vec<usize>> = BTreeMap::new();
+    let mut between: BTreeMap<[usize; 2], Vec<(usize, DQuat)>> = BTreeMap::new();
     for i in (0..pairs.len()).filter(|i| contradicts(*i)) {
-        let [a, b] = ends(&group, i);
-        if a != b && sizes[a].min(sizes[b]) >= MIN_GROUP {
-            between.entry([a, b]).or_default().push(i);
+        let [a, b] = pairs[i].photos.map(|photo| poses[photo as usize]);
+        let (ends, Some(a), Some(b)) = (ends(&group, i), a, b) else {
+            continue;
+        };
+        if ends[0] == ends[1] {
+            continue;
+        }
+        let turn = b.rotation * pairs[i].motion.rotation * a.rotation.inverse();
+        let is_first = group[pairs[i].photos[0] as usize] == ends[0];
+        between
+            .entry(ends)
+            .or_default()
+            .push((i, if is_first { turn } else { turn.inverse() }));
+    }
+    let mut folded = Vec::new();
+    for (ends, turns) in &between {
+        let alike = turned_alike(turns);
+        let photos: BTreeSet<u32> = alike.iter().flat_map(|i| pairs[*i].photos).collect();
+        let is_folded = |of: &usize| photos.iter().filter(|p| group[**p as usize] == *of).count() >= MIN_FOLDED_PHOTOS;
+        if ends.iter().all(is_folded) {
+            folded.extend(alike);
         }
     }
-    let mut folded: Vec<usize> = between
-        .into_values()
-        .filter(|pairs| pairs.len() >= MIN_FOLDED_PAIRS)
-        .flatten()
-        .collect();
     folded.sort_unstable();
     folded
+}
+
+/// The largest set of pairs, given with the rotation that each says, that say one rotation.
+fn turned_alike(turns: &[(usize, DQuat)]) -> Vec<usize> {
+    let alike = |(_, of): &(usize, DQuat)| -> Vec<usize> {
+        let alike = turns
+            .iter()
+            .filter(|(_, turn)| of.angle_between(*turn) < MAX_LOOP_ERROR_RADIANS);
+        alike.map(|(i, _)| *i).collect()
+    };
+    let mut best = Vec::new();
+    for of in turns.iter().map(alike) {
+        if of.len() > best.len() {
+            best = of;
+        }
+    }
+    best
 }
 
 #[cfg(test)]
@@ -66,62 +102,66 @@ mod tests {
     use crate::geometry::essential::Motion;
     use glam::{DQuat, DVec3};
 
-    /// The folded pairs among photographs in two rows, 0, 1, 2 and 3, 4, .., whose neighbours agree; `across` are weak pairs and their
-    /// agreement.
-    fn folded(photos: u32, across: &[([u32; 2], f64)]) -> Vec<[u32; 2]> {
-        let pair = |photos: [u32; 2], matches: u32| VerifiedPair {
+    /// The folded pairs among photographs in two rows, 0, 1, 2 and 3, 4, 5, of which the second is turned by `turn`, radians, beyond its
+    /// poses; neighbours agree. `across` are weak pairs, their agreement, and the error of their rotation, radians.
+    fn folded(turn: f64, across: &[([u32; 2], f64, f64)]) -> Vec<[u32; 2]> {
+        let rotation = |photo: u32| DQuat::from_rotation_y(0.2 * f64::from(photo));
+        let pose = |photo: u32| DPose::from_camera_from_world(rotation(photo), DVec3::X);
+        let poses: Vec<Option<DPose>> = (0..6).map(|photo| Some(pose(photo))).collect();
+        let true_rotation = |photo: u32| rotation(photo) * DQuat::from_rotation_x(if photo < 3 { 0.0 } else { turn });
+        let pair = |photos: [u32; 2], matches: u32, error: f64| VerifiedPair {
             photos,
             matches: (0..matches).map(|i| [i, i]).collect(),
             kind: PairKind::General,
             motion: Motion {
-                rotation: DQuat::IDENTITY,
+                rotation: true_rotation(photos[1]) * true_rotation(photos[0]).inverse() * DQuat::from_rotation_z(error),
                 translation: DVec3::X,
             },
             angle: 0.1,
         };
-        let neighbours = (1..photos)
-            .filter(|i| *i != 3)
-            .map(|i| (pair([i - 1, i], 50), 1.0, Some(1.0)));
+        let neighbours = [[0, 1], [1, 2], [3, 4], [4, 5]].map(|photos| (pair(photos, 50, 0.0), 1.0, Some(1.0)));
         let weak = across
             .iter()
-            .map(|(photos, agreement)| (pair(*photos, 16), 0.5, Some(*agreement)));
+            .map(|(photos, agreement, error)| (pair(*photos, 16, *error), 0.5, Some(*agreement)));
         let mut pairs = Vec::new();
         let (mut strengths, mut agreement) = (Vec::new(), Vec::new());
-        for (pair, strength, agrees) in neighbours.chain(weak) {
+        for (pair, strength, agrees) in neighbours.into_iter().chain(weak) {
             pairs.push(pair);
             strengths.push(strength);
             agreement.push(agrees);
         }
-        let found = folded_pairs(photos as usize, &pairs, &strengths, &agreement);
+        let found = folded_pairs(&poses, &pairs, &strengths, &agreement);
         found.into_iter().map(|i| pairs[i].photos).collect()
     }
 
+    const ACROSS: [([u32; 2], f64, f64); 4] = [
+        ([0, 3], 0.0, 0.0),
+        ([0, 4], 0.1, 0.05),
+        ([1, 4], 0.0, -0.05),
+        ([2, 5], 0.2, 0.0),
+    ];
+
     #[test]
-    fn a_group_that_contradicts_the_rest_is_a_fold() {
-        let contradicting = [([0, 3], 0.0), ([0, 4], 0.1), ([1, 4], 0.0), ([2, 5], 0.2)];
-        let all: Vec<[u32; 2]> = contradicting.iter().map(|pair| pair.0).collect();
-        assert_eq!(folded(6, &contradicting), all);
-        // A pair that agrees by chance does not connect them.
-        let mut by_chance = contradicting.to_vec();
-        by_chance.push(([1, 5], 0.8));
-        assert_eq!(folded(6, &by_chance), all);
+    fn a_group_that_is_turned_relative_to_the_rest_is_a_fold() {
+        let all: Vec<[u32; 2]> = ACROSS.iter().map(|pair| pair.0).collect();
+        assert_eq!(folded(2.0, &ACROSS), all);
+        // Neither a pair that agrees by chance nor a wrong one changes that.
+        let by_chance = [ACROSS.as_slice(), &[([1, 5], 0.8, 2.0), ([1, 3], 0.0, 0.7)]].concat();
+        assert_eq!(folded(2.0, &by_chance), all);
     }
 
     #[test]
-    fn parts_that_look_alike_are_no_fold() {
-        let look_alike = [([0, 4], 0.0), ([1, 4], 0.0), ([0, 5], 0.0)];
+    fn wrong_matches_are_no_fold() {
+        let scattered = ACROSS.map(|(photos, agreement, _)| (photos, agreement, f64::from(photos[0] + photos[1])));
+        assert_eq!(folded(0.0, &scattered), [[0; 2]; 0]);
         let connected = [
-            look_alike.as_slice(),
-            &[([2, 3], 1.0), ([2, 4], 0.9), ([1, 3], 0.9), ([2, 5], 0.8)],
-        ]
-        .concat();
-        assert_eq!(folded(6, &connected), [[0; 2]; 0]);
-        assert_eq!(
-            folded(6, &look_alike[..2]),
-            [[0; 2]; 0],
-            "two pairs may be a coincidence"
-        );
-        let single = [([0, 3], 0.0), ([1, 3], 0.0), ([2, 3], 0.0)];
-        assert_eq!(folded(4, &single), [[0; 2]; 0], "a single photograph");
+            ([2, 3], 1.0, 0.0),
+            ([2, 4], 0.9, 0.0),
+            ([1, 3], 0.9, 0.0),
+            ([1, 5], 0.8, 0.0),
+            ([0, 5], 1.0, 0.0),
+        ];
+        assert_eq!(folded(2.0, &[ACROSS.as_slice(), &connected].concat()), [[0; 2]; 0]);
+        assert_eq!(folded(2.0, &ACROSS[..3]), [[0; 2]; 0], "two photographs of each side");
     }
 }

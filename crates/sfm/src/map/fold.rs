@@ -59,6 +59,9 @@ pub fn folded_pairs(
             continue;
         }
         let turn = b.rotation * pairs[i].motion.rotation * a.rotation.inverse();
+        if turn.angle_between(DQuat::IDENTITY) < MAX_LOOP_ERROR_RADIANS {
+            continue;
+        }
         let is_first = group[pairs[i].photos[0] as usize] == ends[0];
         between
             .entry(ends)
@@ -154,6 +157,11 @@ mod tests {
     fn wrong_matches_are_no_fold() {
         let scattered = ACROSS.map(|(photos, agreement, _)| (photos, agreement, f64::from(photos[0] + photos[1])));
         assert_eq!(folded(0.0, &scattered), [[0; 2]; 0]);
+        assert_eq!(
+            folded(0.05, &ACROSS),
+            [[0; 2]; 0],
+            "not turned: parts that look alike side by side"
+        );
         let connected = [
             ([2, 3], 1.0, 0.0),
             ([2, 4], 0.9, 0.0),

@@ -14,7 +14,7 @@ use irradia_train::eval::{EvalOptions, EvaluatedView, Metrics};
 use irradia_train::field_file;
 use irradia_train::model::Model;
 use irradia_train::report::{
-    Breakdown, InsideLoop, OutsideLoop, Report, ViewReport, machine, peak_rss_bytes, schedule, to_html,
+    Breakdown, Course, InsideLoop, OutsideLoop, Report, ViewReport, machine, peak_rss_bytes, schedule, to_html,
 };
 use irradia_train::socket::Vignette;
 use rayon::prelude::*;
@@ -121,14 +121,14 @@ impl Run {
             half_fit_psnr: mean.half_fit_psnr,
             corner_brightness: trainer.sockets.vignette.as_ref().and_then(Vignette::corner_gain),
             views,
-            schedule: schedule(
-                &trainer.recipe,
-                &journal.stages,
-                &trainer.clock,
-                trainer.skipped,
-                input.steps,
-                input.budget.is_some(),
-            ),
+            schedule: schedule(&Course {
+                recipe: &trainer.recipe,
+                stages: &journal.stages,
+                clock: &trainer.clock,
+                skipped: trainer.skipped,
+                steps: input.steps,
+                timed: input.budget.is_some(),
+            }),
             stages: journal.stages.clone(),
             curve: journal.curve.clone(),
             machine: machine(),

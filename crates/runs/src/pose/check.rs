@@ -8,8 +8,8 @@ use super::view_features::{ViewFeatures, pose};
 use irradia_scene::{Dataset, View};
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::map::{
-    MIN_MISSING_PAIRS, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, VerifiedPair, agreement, contradicted_pairs,
-    contradictions, evidence_pairs, folded_pairs, missing_matches, strengths, verify,
+    MIN_MISSING_PAIRS, MapOptions, Model, ModelPoint, PairKind, PhotoInfo, VerifiedPair, agreement, agrees,
+    contradicted_pairs, contradictions, evidence_pairs, folded_pairs, missing_matches, strengths, verify,
 };
 use irradia_sfm::matching::{MatchOptions, PairOptions, candidate_pairs, match_pairs};
 use rayon::prelude::*;
@@ -35,7 +35,7 @@ pub struct PoseCheck {
     /// Number of pairs that count as evidence: those of adjacent photographs with enough matches, and others that contradict the poses.
     pub pairs: usize,
     /// Names of the pairs whose matches contradict their poses: adjacent ones, those with the most matches first; then weaker ones across
-    /// folds; then, if that is most of them, those of other rotations.
+    /// folds; then, if that is most of those that show depth, those of other motions.
     pub contradicting: Vec<[String; 2]>,
     /// Contradicting pairs whose photographs both agree with others: the poses jump there.
     pub jumps: Vec<[String; 2]>,
@@ -151,7 +151,7 @@ fn absent_pairs(dataset: &Dataset, views: &[&View], photos: &[PhotoInfo]) -> Vec
 /// whereas at a jump the photographs on each side agree with one another.
 fn find_supported(photos: usize, pairs: &[VerifiedPair], strengths: &[f64], agreement: &[Option<f64>]) -> Vec<bool> {
     let mut agreeing = vec![0; photos];
-    let agree = evidence_pairs(pairs, strengths).filter(|i| agreement[*i].is_some_and(|agreement| agreement > 0.5));
+    let agree = evidence_pairs(pairs, strengths).filter(|i| agrees(agreement[*i]));
     for photo in agree.flat_map(|i| pairs[i].photos) {
         agreeing[photo as usize] += 1;
     }

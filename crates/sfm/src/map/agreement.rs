@@ -13,8 +13,9 @@ use std::collections::BTreeSet;
 const MAX_EXAMINED_MATCHES: usize = 100;
 /// Maximum error of a match that agrees, on the plane z = 1: about eight pixels at the usual focal length.
 const MAX_INLIER_ERROR_ON_PLANE: f64 = 0.01;
-/// A pair contradicts the model if less than this fraction of its matches agree.
-pub(super) const MIN_CONSISTENT_FRACTION: f64 = 0.3;
+/// A pair agrees with the model if more than this fraction of its matches do, and contradicts it if less than the second does.
+const MIN_AGREEING_FRACTION: f64 = 0.5;
+const MIN_CONSISTENT_FRACTION: f64 = 0.3;
 /// Distance between two cameras, relative to that of the cameras from the centre of the scene, up to which their pair only turns.
 const MIN_BASELINE: f64 = 0.003;
 /// Number of a photograph's strongest partners that are its neighbours: parts that only look alike share less than one part does.
@@ -53,6 +54,16 @@ pub fn agreement(
         Some(motion.agreeing_fraction(&points, MAX_INLIER_ERROR_ON_PLANE))
     };
     pairs.par_iter().map(inlier_fraction).collect()
+}
+
+/// Whether a pair of which this fraction of the matches agrees ([`agreement`]) agrees with the model.
+pub fn agrees(fraction: Option<f64>) -> bool {
+    fraction.is_some_and(|fraction| fraction > MIN_AGREEING_FRACTION)
+}
+
+/// Whether such a pair contradicts the model.
+pub(super) fn contradicts(fraction: Option<f64>) -> bool {
+    fraction.is_some_and(|fraction| fraction < MIN_CONSISTENT_FRACTION)
 }
 
 /// Some of the matches of a pair on the planes z = 1.
@@ -127,7 +138,7 @@ pub fn evidence_pairs(pairs: &[VerifiedPair], strengths: &[f64]) -> impl Iterato
 /// Indices of the neighbours whose matches contradict the model, most matches first: these pairs are across a fold.
 pub fn contradictions(pairs: &[VerifiedPair], strengths: &[f64], agreement: &[Option<f64>]) -> Vec<usize> {
     let mut found: Vec<usize> = evidence_pairs(pairs, strengths)
-        .filter(|i| agreement[*i].is_some_and(|a| a < MIN_CONSISTENT_FRACTION))
+        .filter(|i| contradicts(agreement[*i]))
         .collect();
     found.sort_by_key(|i| (std::cmp::Reverse(pairs[*i].matches.len()), *i));
     found
@@ -143,15 +154,20 @@ pub(super) fn strongest_first(strengths: &[f64]) -> Vec<usize> {
 /// The spanning tree of the strongest pairs.
 pub fn spanning_tree(photos: usize, pairs: &[VerifiedPair], strengths: &[f64]) -> Vec<usize> {
     let mut order = strongest_first(strengths);
-    let mut part: Vec<u32> = (0..photos as u32).collect();
+    let mut part: Vec<usize> = (0..photos).collect();
     order.retain(|i| {
-        let [to, from] = pairs[*i].photos.map(|p| part[p as usize]);
-        part.iter_mut()
-            .filter(|part| **part == from)
-            .for_each(|part| *part = to);
-        to != from
+        let ends = pairs[*i].photos.map(|p| part[p as usize]);
+        join(&mut part, ends);
+        ends[0] != ends[1]
     });
     order
+}
+
+/// Joins two parts; `part` holds the part of each photograph.
+pub(super) fn join(part: &mut [usize], [to, from]: [usize; 2]) {
+    part.iter_mut()
+        .filter(|part| **part == from)
+        .for_each(|part| *part = to);
 }
 
 /// `[pairs]` whether the photographs of each pair are connected by at most `hops` pairs of `tree`.

@@ -1,6 +1,6 @@
 //! Folds that only weak pairs reveal: a group of photographs that agree with one another, but not with the rest.
 
-use super::agreement::{MIN_CONSISTENT_FRACTION, evidence_pairs};
+use super::agreement::{agrees, contradicts, evidence_pairs, join};
 use super::loops::MAX_LOOP_ERROR_RADIANS;
 use super::types::VerifiedPair;
 use crate::geometry::pose::DPose;
@@ -8,65 +8,33 @@ use glam::DQuat;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// A pair agrees with the model if more than this fraction of its matches do.
-const MIN_AGREEING_FRACTION: f64 = 0.5;
 /// Minimum number of photographs of each group in pairs that turn it alike: a single photograph is wrong by itself, and a few weak pairs
 /// may be of parts of the scene that look alike.
 const MIN_FOLDED_PHOTOS: usize = 3;
 
-/// Indices of the pairs, strong or weak, across folds. Photographs are one group if neighbours agree, and groups are joined while more of
-/// the pairs between them agree with the model than contradict it; `strengths` and `agreement` are `[pairs]`. Nothing else connects the
-/// groups that remain. If pairs between two of them say that one is turned relative to the other, all by the same rotation, the model is
-/// folded, no matter how few matches a pair has; wrong matches say different rotations.
+/// Indices of the pairs, strong or weak, across folds; `strengths` and `agreement` are `[pairs]`. If pairs between two [`groups`] say that
+/// one is turned relative to the other, all by the same rotation, the model is folded, no matter how few matches a pair has, since nothing
+/// else connects the two; wrong matches say different rotations.
 pub fn folded_pairs(
     poses: &[Option<DPose>],
     pairs: &[VerifiedPair],
     strengths: &[f64],
     agreement: &[Option<f64>],
 ) -> Vec<usize> {
-    let agrees = |i: usize| agreement[i].is_some_and(|fraction| fraction > MIN_AGREEING_FRACTION);
-    let contradicts = |i: usize| agreement[i].is_some_and(|fraction| fraction < MIN_CONSISTENT_FRACTION);
-    let mut group: Vec<usize> = (0..poses.len()).collect();
-    let ends = |group: &[usize], i: usize| {
-        let [a, b] = pairs[i].photos.map(|photo| group[photo as usize]);
-        [a.min(b), a.max(b)]
-    };
-    let join = |group: &mut [usize], [to, from]: [usize; 2]| {
-        group.iter_mut().filter(|of| **of == from).for_each(|of| *of = to);
-    };
-    for i in evidence_pairs(pairs, strengths).filter(|i| agrees(*i)) {
-        let joined = ends(&group, i);
-        join(&mut group, joined);
-    }
-    loop {
-        let mut balance: BTreeMap<[usize; 2], i64> = BTreeMap::new();
-        for i in 0..pairs.len() {
-            *balance.entry(ends(&group, i)).or_default() += i64::from(agrees(i)) - i64::from(contradicts(i));
-        }
-        let apart = balance.into_iter().filter(|([a, b], balance)| a != b && *balance > 0);
-        let Some((joined, _)) = apart.max_by_key(|(ends, balance)| (*balance, Reverse(*ends))) else {
-            break;
-        };
-        join(&mut group, joined);
-    }
+    let group = groups(poses.len(), pairs, strengths, agreement);
     let mut between: BTreeMap<[usize; 2], Vec<(usize, DQuat)>> = BTreeMap::new();
-    for i in (0..pairs.len()).filter(|i| contradicts(*i)) {
-        let [a, b] = pairs[i].photos.map(|photo| poses[photo as usize]);
-        let (ends, Some(a), Some(b)) = (ends(&group, i), a, b) else {
+    for (i, pair) in pairs.iter().enumerate().filter(|(i, _)| contradicts(agreement[*i])) {
+        let [Some(a), Some(b)] = pair.photos.map(|photo| poses[photo as usize]) else {
             continue;
         };
-        if ends[0] == ends[1] {
-            continue;
+        let turn = b.rotation * pair.motion.rotation * a.rotation.inverse();
+        let is_turned = turn.angle_between(DQuat::IDENTITY) >= MAX_LOOP_ERROR_RADIANS;
+        let [of_a, of_b] = pair.photos.map(|photo| group[photo as usize]);
+        if is_turned && of_a < of_b {
+            between.entry([of_a, of_b]).or_default().push((i, turn));
+        } else if is_turned && of_a > of_b {
+            between.entry([of_b, of_a]).or_default().push((i, turn.inverse()));
         }
-        let turn = b.rotation * pairs[i].motion.rotation * a.rotation.inverse();
-        if turn.angle_between(DQuat::IDENTITY) < MAX_LOOP_ERROR_RADIANS {
-            continue;
-        }
-        let is_first = group[pairs[i].photos[0] as usize] == ends[0];
-        between
-            .entry(ends)
-            .or_default()
-            .push((i, if is_first { turn } else { turn.inverse() }));
     }
     let mut folded = Vec::new();
     for (ends, turns) in &between {
@@ -79,6 +47,32 @@ pub fn folded_pairs(
     }
     folded.sort_unstable();
     folded
+}
+
+/// `[photos]` the group of each photograph, a number. Photographs are one group if neighbours agree, and groups are joined while more of the
+/// pairs between them agree with the model than contradict it.
+fn groups(photos: usize, pairs: &[VerifiedPair], strengths: &[f64], agreement: &[Option<f64>]) -> Vec<usize> {
+    let mut group: Vec<usize> = (0..photos).collect();
+    let ends = |group: &[usize], i: usize| {
+        let [a, b] = pairs[i].photos.map(|photo| group[photo as usize]);
+        [a.min(b), a.max(b)]
+    };
+    for i in evidence_pairs(pairs, strengths).filter(|i| agrees(agreement[*i])) {
+        let joined = ends(&group, i);
+        join(&mut group, joined);
+    }
+    loop {
+        let mut balance: BTreeMap<[usize; 2], i64> = BTreeMap::new();
+        for (i, fraction) in agreement.iter().enumerate() {
+            *balance.entry(ends(&group, i)).or_default() +=
+                i64::from(agrees(*fraction)) - i64::from(contradicts(*fraction));
+        }
+        let apart = balance.into_iter().filter(|([a, b], balance)| a != b && *balance > 0);
+        let Some((joined, _)) = apart.max_by_key(|(ends, balance)| (*balance, Reverse(*ends))) else {
+            return group;
+        };
+        join(&mut group, joined);
+    }
 }
 
 /// The largest set of pairs, given with the rotation that each says, that say one rotation.

@@ -46,7 +46,8 @@ const MAX_FINAL_ROUNDS: usize = 3;
 /// may lead to a wrong model of all photographs, which explains a third of their observations instead of nine tenths: where focal lengths
 /// are guessed, or end far from where they began, the model must explain most observations as well. So must a model of few photographs: a
 /// seed with wrong poses hardly finds others that disagree. A model that most of its pairs contradict never suffices: two motions fit a
-/// plane, and from the wrong one a model grows that fits the ground and nothing above it. The failures of the best seed are added to `failed_registrations`.
+/// plane, and from the wrong one a model grows that fits the ground and nothing above it. The failures of the best seed are added to
+/// `failed_registrations`.
 pub(super) fn grow_model<'a>(
     input: &Input<'a>,
     pairs: &[VerifiedPair],
@@ -78,10 +79,10 @@ pub(super) fn grow_model<'a>(
         }
         // Two earlier seeds led to the same model, which agrees with this seed: it would lead there once more. 984 frames of two films of
         // a brick car, whose models explain 0.74 of their observations, used up all seeds, a minute each, and ended as the second.
-        let containing: Vec<&SeedOutcome> = (outcomes.iter())
+        let agreeing: Vec<&SeedOutcome> = (outcomes.iter())
             .filter(|outcome| agrees_with(&outcome.poses, &pairs[seed]) == Some(true))
             .collect();
-        if (1..containing.len()).any(|i| containing[..i].iter().any(|other| containing[i].is_similar(other))) {
+        if (1..agreeing.len()).any(|i| agreeing[..i].iter().any(|other| agreeing[i].is_similar(other))) {
             continue;
         }
         seeds_left -= 1;

@@ -7,6 +7,7 @@ use std::collections::BTreeMap;
 /// Maximum angle of a loop of three pairs that agree, radians: the error of two-view rotations with a guessed focal length
 /// (Zach, Klopschitz and Pollefeys, "Disambiguating visual relations using loop constraints", 2010, allow 2 to 5 degrees per pair).
 pub(super) const MAX_LOOP_ERROR_RADIANS: f64 = 0.17;
+
 /// `[pairs]` the weighted fraction, in \[0, 1\], of the loops of three pairs through each pair that close; 0.5 without any loop.
 pub(crate) fn closed_loop_fractions(photos: usize, pairs: &[VerifiedPair], measured: &[DQuat]) -> Vec<f64> {
     let mut pairs_of: Vec<BTreeMap<usize, usize>> = vec![BTreeMap::new(); photos];

@@ -34,7 +34,7 @@ mod verify;
 mod zoom;
 
 pub(crate) use agreement::normalized_matches;
-pub use agreement::{agreement, contradictions, evidence_pairs, strengths};
+pub use agreement::{agreement, agrees, contradictions, evidence_pairs, strengths};
 pub use contradicted::contradicted_pairs;
 pub use distance::{Distance, DistanceFit, scale_to_distances};
 pub use focal::FocalSource;

@@ -8,7 +8,7 @@
 //! For few photographs, the tree has few pairs across a fold, often a single one, and all pairs are close. All neighbours then count as
 //! evidence, and closer and closer pairs are tried.
 
-use super::agreement::{MIN_CONSISTENT_FRACTION, agreement, contradictions, near_in_tree, spanning_tree, strengths};
+use super::agreement::{agreement, contradictions, contradicts, near_in_tree, spanning_tree, strengths};
 use super::types::{FEW_PHOTOS, Model, Progress, VerifiedPair};
 use super::{GrownModels, Input, grow_models};
 
@@ -80,8 +80,7 @@ pub(super) fn unfold(input: &Input, found: GrownModels, progress: &mut dyn FnMut
         let contradicting = if few {
             contradictions(pairs, &strengths, &agreement).len()
         } else {
-            let contradicts = |i: &&usize| agreement[**i].is_some_and(|a| a < MIN_CONSISTENT_FRACTION);
-            tree.iter().filter(contradicts).count()
+            tree.iter().filter(|i| contradicts(agreement[**i])).count()
         };
         Candidate {
             grown,

@@ -9,7 +9,7 @@ mod schedule;
 
 pub use columns::columns;
 pub use machine::{Machine, machine, peak_rss_bytes};
-pub use schedule::{KnobCurve, Schedule, schedule};
+pub use schedule::{Course, KnobCurve, Schedule, schedule};
 
 use crate::times::Times;
 use serde::{Deserialize, Deserializer, Serialize};

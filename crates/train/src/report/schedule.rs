@@ -32,17 +32,27 @@ pub struct KnobCurve {
 /// Approximate number of samples of a run.
 const TARGET_SAMPLES: f64 = 160.0;
 
-/// The schedule of a run of `recipe` at `clock` with the stages `stages`, which began after the first `skipped` recipe steps. `steps` is
-/// the number of steps into which the others were fitted, `timed` whether they were fitted into a time budget instead.
-pub fn schedule(
-    recipe: &Recipe,
-    stages: &[StageReport],
-    clock: &Clock,
-    skipped: f64,
-    steps: Option<u64>,
-    timed: bool,
-) -> Schedule {
-    let spans = spans(recipe, stages, clock, skipped, steps, timed);
+/// A run, as far as its schedule depends on it.
+#[derive(Clone, Copy)]
+pub struct Course<'a> {
+    /// Its recipe.
+    pub recipe: &'a Recipe,
+    /// The stages that it has entered.
+    pub stages: &'a [StageReport],
+    /// Its clock at the end.
+    pub clock: &'a Clock,
+    /// Recipe steps before its first step.
+    pub skipped: f64,
+    /// The number of steps into which the others were fitted.
+    pub steps: Option<u64>,
+    /// Whether they were fitted into a time budget instead.
+    pub timed: bool,
+}
+
+/// The schedule of a run.
+pub fn schedule(course: &Course) -> Schedule {
+    let Course { recipe, skipped, .. } = *course;
+    let spans = spans(course);
     let mut run = Clock::new(recipe);
     run.advance(recipe, skipped);
     let mut quiet = recipe.clone();
@@ -107,15 +117,16 @@ struct Span {
     known: bool,
 }
 
-/// The spans of the stages that the run has entered.
-fn spans(
-    recipe: &Recipe,
-    stages: &[StageReport],
-    clock: &Clock,
-    skipped: f64,
-    steps: Option<u64>,
-    timed: bool,
-) -> Vec<Span> {
+/// The spans of the stages that a run has entered.
+fn spans(course: &Course) -> Vec<Span> {
+    let Course {
+        recipe,
+        stages,
+        clock,
+        skipped,
+        steps,
+        timed,
+    } = *course;
     let total = recipe.total_steps() as f64;
     let (mut spans, mut entered, mut start) = (Vec::new(), 0, 0.0);
     for (i, stage) in recipe.stage.iter().enumerate().take(clock.stage + 1) {
@@ -237,7 +248,14 @@ mod tests {
             stage("grow", 51, 100),
             stage("refine", 101, 200),
         ];
-        let schedule = schedule(&recipe, &stages, &ended(&recipe), 0.0, Some(200), false);
+        let schedule = schedule(&Course {
+            recipe: &recipe,
+            stages: &stages,
+            clock: &ended(&recipe),
+            skipped: 0.0,
+            steps: Some(200),
+            timed: false,
+        });
         assert!(schedule.done && schedule.steps.windows(2).all(|w| w[0] <= w[1]));
         assert_eq!(schedule.steps.last(), Some(&200.0));
         assert!((at(&schedule, "rate.means", 100.0) - 2.0).abs() < 1e-3);
@@ -280,7 +298,14 @@ mod tests {
             stage("grow", 41, 140),
             stage("refine", 141, 340),
         ];
-        let schedule = schedule(&recipe, &stages, &clock, 0.0, None, false);
+        let schedule = schedule(&Course {
+            recipe: &recipe,
+            stages: &stages,
+            clock: &clock,
+            skipped: 0.0,
+            steps: None,
+            timed: false,
+        });
         assert!(schedule.done);
         for (step, name, of) in [
             (20.0, "scale.image", truth[20].image_scale),
@@ -308,11 +333,35 @@ mod tests {
             ..Clock::new(&recipe)
         };
         let stages = [stage("warmup", 1, 100), stage("grow", 101, 150)];
-        let half = schedule(&recipe, &stages, &clock, 0.0, None, false);
+        let half = schedule(&Course {
+            recipe: &recipe,
+            stages: &stages,
+            clock: &clock,
+            skipped: 0.0,
+            steps: None,
+            timed: false,
+        });
         assert!(half.done && half.steps.last() == Some(&150.0));
-        assert!(!schedule(&recipe, &stages, &clock, 0.0, None, true).done);
+        assert!(
+            !schedule(&Course {
+                recipe: &recipe,
+                stages: &stages,
+                clock: &clock,
+                skipped: 0.0,
+                steps: None,
+                timed: true
+            })
+            .done
+        );
         assert_eq!(
-            schedule(&recipe, &[], &Clock::new(&recipe), 0.0, None, false),
+            schedule(&Course {
+                recipe: &recipe,
+                stages: &[],
+                clock: &Clock::new(&recipe),
+                skipped: 0.0,
+                steps: None,
+                timed: false
+            }),
             Schedule {
                 done: true,
                 ..Schedule::default()
@@ -328,7 +377,14 @@ mod tests {
             (250.0, 1.5, vec![stage("refine", 1, 75)]),
             (150.0, 2.5, vec![stage("grow", 1, 15), stage("refine", 16, 75)]),
         ] {
-            let schedule = schedule(&recipe, &stages, &ended(&recipe), skipped, Some(75), false);
+            let schedule = schedule(&Course {
+                recipe: &recipe,
+                stages: &stages,
+                clock: &ended(&recipe),
+                skipped,
+                steps: Some(75),
+                timed: false,
+            });
             let rates = schedule.knobs.iter().find(|knob| knob.name == "rate.means").unwrap();
             assert!(schedule.done && schedule.steps.windows(2).all(|w| w[0] <= w[1]));
             for (step, value) in schedule.steps.iter().zip(&rates.values) {

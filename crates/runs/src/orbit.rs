@@ -3,14 +3,15 @@
 use std::f32::consts::{FRAC_PI_2, PI, TAU};
 
 use glam::{DQuat, DVec3, Vec3};
-use irradia_scene::{Camera, Intrinsics, Pose, survey};
+use irradia_scene::{Camera, Intrinsics, Pose, median, survey};
 use irradia_sfm::upright;
 use irradia_splat::{Splats, init::focus_point};
 
 /// Where a scene is viewed from.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct OrbitGeometry {
-    /// The focus of the training cameras, the ground below the cameras of a survey, or the middle of most splats; world.
+    /// The focus of the training cameras, the ground below the cameras of a survey, what is before cameras whose focus is behind them, or
+    /// the middle of most splats; world.
     pub center: Vec3,
     /// Unit vector, derived from how the cameras were held.
     pub up: Vec3,
@@ -89,13 +90,33 @@ fn center_and_up(splats: Option<&Splats>, cameras: &[Camera]) -> (Vec3, Vec3) {
             .step_by(every)
             .map(|i| Vec3::from(splats.mean(i)).as_dvec3())
     });
-    match survey(&poses, points.filter(|point| point.is_finite())) {
+    let points: Vec<DVec3> = points.filter(|point| point.is_finite()).collect();
+    match survey(&poses, points.iter().copied()) {
         Some(survey) => (survey.center.as_vec3(), survey.up.as_vec3()),
         None => {
             let up = upright::up(poses.iter().map(|(rotation, _)| (*rotation, None)));
-            (focus_point(cameras), up.as_vec3())
+            let focus = focus_point(cameras);
+            let center = center_ahead(&poses, &points, focus.as_dvec3()).map_or(focus, |center| center.as_vec3());
+            (center, up.as_vec3())
         }
     }
+}
+
+/// Minimum length of the mean viewing direction of cameras that look one way, not around them.
+const MIN_COMMON_DIRECTION: f64 = 0.5;
+
+/// If cameras of these world-from-camera rotations and positions look one way with the `focus` behind them, as in a film that turns as it
+/// moves ahead: the place at the median distance of the `points` before them.
+fn center_ahead(poses: &[(DQuat, DVec3)], points: &[DVec3], focus: DVec3) -> Option<DVec3> {
+    let n = poses.len() as f64;
+    let forward = poses.iter().map(|(rotation, _)| *rotation * DVec3::Z).sum::<DVec3>() / n;
+    let mean = poses.iter().map(|(_, position)| *position).sum::<DVec3>() / n;
+    if forward.length() < MIN_COMMON_DIRECTION || (focus - mean).dot(forward) > 0.0 {
+        return None;
+    }
+    let forward = forward.normalize();
+    let depths = points.iter().map(|point| (*point - mean).dot(forward));
+    Some(mean + median(depths.filter(|depth| *depth > 0.0).collect())? * forward)
 }
 
 /// A gap between the azimuths of adjacent cameras beyond which that side counts as not photographed, radians.
@@ -239,5 +260,38 @@ mod tests {
                 camera.pose
             );
         }
+    }
+
+    #[test]
+    fn cameras_that_turn_away_from_each_other_are_before_the_scene() {
+        let cloud = GaussianCloud {
+            means: (0..100)
+                .map(|i| [0.3 * (i % 10) as f32 - 1.5, 5.0, 0.1 * (i / 10) as f32])
+                .collect(),
+            quats: vec![[1.0, 0.0, 0.0, 0.0]; 100],
+            log_scales: vec![[-3.0; 3]; 100],
+            opacity_logits: vec![2.0; 100],
+            sh: vec![0.0; 300],
+            sh_degree: 0,
+            ..GaussianCloud::default()
+        };
+        // The axes meet behind the cameras.
+        let camera = |i: usize| {
+            let x = 0.1 * (i as f32 - 4.0);
+            let pose = Pose::look_at(Vec3::new(x, 0.0, 1.0), Vec3::new(6.0 * x, 5.0, 0.5), Vec3::Z);
+            Camera::new(pose, Intrinsics::from_fov_x(64, 48, 1.0))
+        };
+        let cameras: Vec<Camera> = (0..9).map(camera).collect();
+        assert!(focus_point(&cameras).y < 0.0);
+        let center = orbit_geometry(Some(&Splats::from_cloud(&cloud)), Some(&cameras)).center;
+        assert!((center - Vec3::new(0.0, 5.0, 0.5)).length() < 0.2, "{center}");
+        // Those that look around them orbit their middle.
+        let around = ring((0..12).map(|i| 30.0 * i as f32)).into_iter().map(|mut camera| {
+            camera.pose.rotation = Quat::from_rotation_z(std::f32::consts::PI) * camera.pose.rotation;
+            camera
+        });
+        let around: Vec<Camera> = around.collect();
+        let center = orbit_geometry(Some(&Splats::from_cloud(&cloud)), Some(&around)).center;
+        assert!((center - focus_point(&around)).length() < 1e-4, "{center}");
     }
 }

@@ -12,9 +12,9 @@ use std::collections::{BTreeMap, BTreeSet};
 /// may be of parts of the scene that look alike.
 const MIN_FOLDED_PHOTOS: usize = 3;
 
-/// Indices of the pairs, strong or weak, across folds; `strengths` and `agreement` are `[pairs]`. If pairs between two [`groups`] say that
-/// one is turned relative to the other, all by the same rotation, the model is folded, no matter how few matches a pair has, since nothing
-/// else connects the two; wrong matches say different rotations.
+/// Indices of the pairs, strong or weak, across folds; `strengths` and `agreement` are `[pairs]`. If pairs between two groups of
+/// photographs say that one is turned relative to the other, all by the same rotation, the model is folded, no matter how few matches a
+/// pair has, since nothing else connects the two; wrong matches say different rotations.
 pub fn folded_pairs(
     poses: &[Option<DPose>],
     pairs: &[VerifiedPair],
@@ -49,8 +49,8 @@ pub fn folded_pairs(
     folded
 }
 
-/// `[photos]` the group of each photograph, a number. Photographs are one group if neighbours agree, and groups are joined while more of the
-/// pairs between them agree with the model than contradict it.
+/// `[photos]` the number of each photograph's group. Photographs are one group if neighbours agree, and groups are joined while more of
+/// the pairs between them agree with the model than contradict it.
 fn groups(photos: usize, pairs: &[VerifiedPair], strengths: &[f64], agreement: &[Option<f64>]) -> Vec<usize> {
     let mut group: Vec<usize> = (0..photos).collect();
     let ends = |group: &[usize], i: usize| {

@@ -98,6 +98,35 @@ fn transforms(count: usize, keys: &str) -> String {
     format!("{{{keys}, \"frames\": [{}]}}", frames.join(","))
 }
 
+#[test]
+fn photographs_of_datasets_that_were_moved_are_found() {
+    let folder = pictures(4, 40, 30);
+    let keys = r#""w": 40, "h": 30, "fl_x": 30, "fl_y": 30"#;
+    let here = transforms(4, keys);
+    // Named by another machine, before they were converted.
+    for there in [
+        "/home/user/scene/images/",
+        "C:\\\\scene\\\\images\\\\",
+        "../scene/images/",
+    ] {
+        let text = here.replace("images/", there).replace(".png", ".jpeg");
+        fs::write(folder.path().join("transforms.json"), text).unwrap();
+        let names: Vec<String> = (read(folder.path()).unwrap().views.iter())
+            .map(|view| view.name.clone())
+            .collect();
+        assert_eq!(
+            names,
+            ["images/00.png", "images/01.png", "images/02.png", "images/03.png"]
+        );
+    }
+    fs::write(
+        folder.path().join("transforms.json"),
+        here.replace("images/", "others/"),
+    )
+    .unwrap();
+    assert!(read(folder.path()).is_err());
+}
+
 fn write_colmap_text(root: &Path, camera: &str, names: &[&str]) {
     let folder = root.join("sparse/0");
     fs::create_dir_all(&folder).unwrap();

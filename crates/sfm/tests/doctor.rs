@@ -8,12 +8,21 @@ use irradia_sfm::Features;
 use irradia_sfm::PairMatches;
 use irradia_sfm::doctor::{Appearance, Diagnosis, Evidence, Kind, diagnose};
 use irradia_sfm::geometry::pose::DPose;
-use irradia_sfm::map::{MapOptions, Model, verify};
+use irradia_sfm::map::{MapOptions, Model, Reconstruction, verify};
 use world::{CAMERA, World, around, look};
 
-/// All diagnoses of a world: with the model, and from its pairs only.
+/// All diagnoses of a world: with its model, and from its pairs only.
 fn examine(world: &World, appearances: &[Appearance], colors: &[Vec<[u8; 3]>]) -> [Vec<Diagnosis>; 2] {
-    let found = world.map();
+    examine_mapped(world, &world.map(), appearances, colors)
+}
+
+/// All diagnoses of a world: with the models `found`, and from its pairs only.
+fn examine_mapped(
+    world: &World,
+    found: &Reconstruction,
+    appearances: &[Appearance],
+    colors: &[Vec<[u8; 3]>],
+) -> [Vec<Diagnosis>; 2] {
     let (cameras, pairs) = verify(
         &world.photos,
         &world.features,
@@ -286,6 +295,21 @@ fn a_zoom_that_no_metadata_tell_is_named_and_mapped_with_its_own_focal_length() 
     let focal = |group: usize| model.cameras[group].as_ref().expect("used").focal();
     assert!((focal(0) / 870.0 - 1.0).abs() < 0.01, "{}", focal(0));
     assert!((focal(1) / 1305.0 - 1.0).abs() < 0.01, "{}", focal(1));
+}
+
+#[test]
+fn a_model_that_moves_otherwise_than_most_pairs_is_named() {
+    let world = ring(24, 2500, 0..0);
+    let mut found = world.map();
+    found.models[0].poses.reverse();
+    let [mapped, alone] = examine_mapped(&world, &found, &sharp(&world), &grey(&world));
+    assert!(
+        mapped
+            .iter()
+            .any(|d| matches!(d, Diagnosis::OtherMotion { pairs } if pairs.len() > 20)),
+        "{mapped:?}"
+    );
+    assert_eq!(alone, [], "no model");
 }
 
 #[test]

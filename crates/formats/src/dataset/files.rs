@@ -25,6 +25,17 @@ pub(super) fn find_image(path: &Path) -> Option<PathBuf> {
     added.chain(replaced).find(|candidate| candidate.is_file())
 }
 
+/// Where the file may be to which a dataset in `root` refers by `name`: there, or at an end of that path below `root`, the longest first,
+/// since datasets are moved and absolute paths are those of another machine.
+pub(super) fn possible_paths(root: &Path, name: &str) -> impl Iterator<Item = PathBuf> {
+    let name = PathBuf::from(name.replace('\\', "/"));
+    let ends = (1..name.components().count()).map({
+        let (root, name) = (root.to_owned(), name.clone());
+        move |first| root.join(name.components().skip(first).collect::<PathBuf>())
+    });
+    std::iter::once(root.join(name)).chain(ends)
+}
+
 /// `path` below `root`, with forward slashes and without `./`.
 pub(super) fn relative_name(root: &Path, path: &Path) -> String {
     let below = path.strip_prefix(root).unwrap_or(path);

@@ -121,7 +121,21 @@ pub fn pose_first(input: &mut TrainInput, poses: Poses, anyway: bool) -> Result<
             "warning: {dataset} is a dataset with poses: name it instead to use them"
         ));
     }
-    let report = pose_into_run(input, poses, None)?;
+    pose_all(input, None, poses, anyway)?;
+    Ok(())
+}
+
+/// Poses the photographs of `input`, or `only` some, into the folder `posed` of its run, and makes that its dataset. Fails if too few can be
+/// posed, unless `anyway`.
+pub fn pose_all(
+    input: &mut TrainInput,
+    only: Option<HashSet<PathBuf>>,
+    poses: Poses,
+    anyway: bool,
+) -> Result<PoseReport> {
+    input.data = photo_folder(input);
+    (input.reading.format, input.reading.images) = (None, None);
+    let report = pose_into_run(input, poses, only)?;
     let posed = &input.data;
     if report.fraction() < MIN_POSED_FRACTION && !anyway {
         let reasons: Vec<&str> = report
@@ -150,22 +164,14 @@ pub fn pose_first(input: &mut TrainInput, poses: Poses, anyway: bool) -> Result<
         ))
         .into());
     }
-    Ok(())
+    Ok(report)
 }
 
 /// As [`pose_first`], for photographs whose poses in `dataset` are not used; the same views are held out, left out and trained on. Fails if
 /// no pose is found for a held-out view, or for more than a few of the others, unless `anyway`, which trains on those with poses.
 pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses, anyway: bool) -> Result<()> {
-    if let Some(images) = input.reading.images.take() {
-        input.data = images;
-    }
-    if input.data.is_file()
-        && let Some(folder) = input.data.parent()
-    {
-        // The file that describes the dataset.
-        input.data = folder.to_owned();
-    }
-    input.reading.format = None;
+    input.data = photo_folder(input);
+    (input.reading.format, input.reading.images) = (None, None);
     let names_of = |views: &[usize]| -> Vec<String> {
         let names = views.iter().map(|view| bare_name(&dataset.views[*view].name));
         names.map(str::to_owned).collect()
@@ -200,6 +206,27 @@ pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses, anywa
         write_atomic(&list, |out| out.write_all(names.as_bytes()))?;
     }
     Ok(())
+}
+
+/// The folder that contains the photographs of a dataset.
+fn photo_folder(input: &TrainInput) -> PathBuf {
+    match &input.reading.images {
+        Some(images) => images.clone(),
+        // A file that describes the dataset.
+        None if input.data.is_file() => input.data.parent().unwrap_or(&input.data).to_owned(),
+        None => input.data.clone(),
+    }
+}
+
+/// All photographs in the folders of those of `dataset`, if it has poses of fewer than half of them: a program that could not connect
+/// photographs may have kept a model of three. Rendered scenes name the views of each split, and may name few.
+pub fn mostly_unposed(input: &TrainInput, dataset: &Dataset) -> Option<HashSet<PathBuf>> {
+    let folder = photo_folder(input);
+    let posed = files_of(dataset, &folder).filter(|_| dataset.kind != "Blender")?;
+    let folders: HashSet<&Path> = posed.iter().filter_map(|file| file.parent()).collect();
+    let mut all = photographs_in(&folder);
+    all.retain(|file| file.parent().is_some_and(|folder| folders.contains(folder)));
+    (2 * posed.len() < all.len()).then(|| all.into_iter().collect())
 }
 
 /// The files below `folder` of the photographs that `dataset` trains on or holds out; `None` if that of a view cannot be told.

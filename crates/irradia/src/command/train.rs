@@ -1,7 +1,7 @@
 //! `irradia train`
 
 use super::lpips::{self, lpips_path, unseen_lpips_path};
-use super::pose::{Poses, is_unposed, pose_again, pose_first};
+use super::pose::{Poses, is_unposed, mostly_unposed, pose_again, pose_all, pose_first};
 use super::progress::{Progress, format_size};
 use super::size::memory_size;
 use super::view::ListenArgs;
@@ -20,6 +20,7 @@ use irradia_runs::{
     read_recipe, scene_path,
 };
 use irradia_train::event::Observer;
+use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 
@@ -40,7 +41,7 @@ pub struct Args {
     #[arg(long, value_name = "SCENE", conflicts_with = "resume")]
     pub from: Option<PathBuf>,
     /// Poses to use: those given with the photographs, or new ones by irradia, or by colmap, if it is installed. When absent the given
-    /// ones, unless there are none or the photographs contradict them; then irradia's
+    /// ones, unless there are none, most photographs have none, or the photographs contradict them; then irradia's
     #[arg(long, value_name = "WHO", value_enum, conflicts_with_all = ["resume", "replay"])]
     pub poses: Option<PosesArg>,
     /// Where splats begin if the dataset has poses and no points: at points found by matching its photographs (matched), or at random
@@ -301,20 +302,44 @@ fn with_poses_of(from: &Path, mut input: TrainInput, poses: Option<PosesArg>) ->
     }
 }
 
-/// The dataset of `input`, whose photographs have poses: with the given poses, or with new ones if they are requested or the photographs
-/// contradict the given ones.
+/// The dataset of `input`, whose photographs have poses: with the given poses, or with new ones if they are requested, the photographs
+/// contradict the given ones, or most photographs have none.
 fn with_poses(input: TrainInput, poses: Option<PosesArg>, anyway: bool) -> Result<(TrainRequest, Dataset)> {
-    let given = read(input.clone())?;
+    let mut given = read(input.clone())?;
     RunFolder::check_free(&input.out, input.overwrite)?;
-    if let Some(mapper) = poses.and_then(PosesArg::mapper) {
-        let mut again = input;
-        pose_again(&mut again, &given.1, mapper, anyway)?;
-        return read(again);
-    }
     // Rendered scenes are exact, and our own poses have been checked.
     let is_sure = is_rendered(&given.1) || pose_source(&input.data) == Some(PoseSource::Irradia);
-    if poses.is_some() || is_sure {
-        return Ok(given);
+    let unposed = mostly_unposed(&input, &given.1).filter(|_| !is_sure);
+    match (poses.map(PosesArg::mapper), unposed) {
+        (Some(Some(mapper)), unposed) => {
+            let mut again = input;
+            match unposed {
+                Some(files) => drop(pose_all(&mut again, Some(files), mapper, anyway)?),
+                None => pose_again(&mut again, &given.1, mapper, anyway)?,
+            }
+            return read(again);
+        }
+        (Some(None), _) => return Ok(given),
+        (None, Some(files)) => {
+            let posed = given.1.views.len();
+            let line = format!("only {posed} of {} photographs have poses", files.len());
+            note(format_args!(
+                "{line}: finding new ones; --poses given keeps the given ones"
+            ));
+            match pose_others(input.clone(), posed, files) {
+                Ok((request, mut dataset)) => {
+                    let line = format!("{line}: new ones are used, in a world of their own");
+                    dataset.warnings.push(line);
+                    return Ok((request, dataset));
+                }
+                Err(error) => {
+                    let line = format!("{line}, and they are used after all: {}", one_line(&error));
+                    given.1.warnings.push(line);
+                }
+            }
+        }
+        (None, None) if is_sure => return Ok(given),
+        (None, None) => {}
     }
     let found = check(&input)?;
     if !found.is_broken() {
@@ -323,7 +348,6 @@ fn with_poses(input: TrainInput, poses: Option<PosesArg>, anyway: bool) -> Resul
             "{agree} of {} pairs of photographs agree with the given poses",
             found.pairs
         ));
-        let mut given = given;
         if let Some([a, b]) = found.absent.first() {
             let n = found.absent.len();
             given.1.warnings.push(format!(
@@ -350,6 +374,18 @@ fn with_poses(input: TrainInput, poses: Option<PosesArg>, anyway: bool) -> Resul
             Ok(given)
         }
     }
+}
+
+/// The dataset of `input` with new poses of the photographs `files`, of which its own has poses of `posed`, if at least twice as many are
+/// found.
+fn pose_others(mut input: TrainInput, posed: usize, files: HashSet<PathBuf>) -> Result<(TrainRequest, Dataset)> {
+    let report = pose_all(&mut input, Some(files), Poses::Irradia, true)?;
+    ensure!(
+        report.registered >= 2 * posed,
+        "new ones were found for {} only",
+        report.registered
+    );
+    read(input)
 }
 
 /// The dataset of `input` with new poses, if the share of pairs that contradict them is less than half of `contradicted`, that of the poses

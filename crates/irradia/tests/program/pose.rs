@@ -77,6 +77,32 @@ fn given_poses_that_photographs_contradict_are_replaced_and_others_are_on_reques
     irradia(folder.path(), "train can/images --out none --poses given").refused(2, &["no poses", "--poses given"]);
 }
 
+#[test]
+fn photographs_of_which_most_have_no_poses_get_new_ones() {
+    let Some(door) = shared("data/lund_door/images") else {
+        return;
+    };
+    let folder = tempfile::tempdir().expect("a folder");
+    copy(&door, &folder.path().join("door/images"), 12);
+    // As after a program that could not connect the others.
+    let frame = |i: usize| {
+        let pose = json!([[1, 0, 0, i], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]);
+        json!({ "file_path": format!("images/DSC_000{i}.JPG"), "transform_matrix": pose })
+    };
+    let transforms = json!({ "camera_angle_x": 0.9, "frames": [frame(1), frame(2), frame(3)] });
+    fs::write(folder.path().join("door/transforms.json"), transforms.to_string()).expect("written");
+    let given = "train door --out given --steps 2 --max-side 120 --poses given";
+    let given = irradia(folder.path(), given).success();
+    assert!(!given.stderr.contains("have poses"), "{given:#?}");
+    let trained = irradia(folder.path(), "train door --out run --steps 2 --max-side 120").success();
+    let line = "only 3 of 12 photographs have poses: new ones are used";
+    assert!(trained.stderr.contains(line), "{trained:#?}");
+    assert_eq!(json(&folder.path().join("run/posed/pose.json"))["registered"], 12);
+    let request = "train door --out again --steps 2 --max-side 120 --poses irradia";
+    irradia(folder.path(), request).success();
+    assert_eq!(json(&folder.path().join("again/posed/pose.json"))["registered"], 12);
+}
+
 /// The layout of Blender scenes, with opaque photographs, some of them in two folders.
 #[test]
 fn photographs_laid_out_like_a_rendered_scene_have_their_poses_checked_and_keep_their_split() {

@@ -6,7 +6,9 @@
 use super::{Diagnosis, Evidence, GlobalRotations, average_rotations};
 use crate::Features;
 use crate::geometry::essential::{Motion, refine_motion};
-use crate::map::{GroupCamera, PhotoInfo, VerifiedPair, agreement, contradictions, normalized_matches, strengths};
+use crate::map::{
+    GroupCamera, PhotoInfo, VerifiedPair, agreement, contradicted_pairs, contradictions, normalized_matches, strengths,
+};
 use glam::{DQuat, DVec2};
 use irradia_scene::Rng;
 use rayon::prelude::*;
@@ -126,6 +128,15 @@ fn motion_near_prediction(points: &[[DVec2; 2]], predicted: DQuat, seed: u64) ->
     }
     let fraction = motion.agreeing_fraction(points, INLIER_THRESHOLD);
     (fraction, (fraction > MIN_INLIER_FRACTION).then_some(motion.rotation))
+}
+
+/// Diagnoses a model that grew from a motion that fits only a plane.
+pub(super) fn other_motion(evidence: &Evidence) -> Option<Diagnosis> {
+    let found = contradicted_pairs(evidence.pairs, &evidence.model()?.poses);
+    let pairs: Vec<[usize; 2]> = (found.iter())
+        .map(|i| evidence.pairs[*i].photos.map(|photo| photo as usize))
+        .collect();
+    (!pairs.is_empty()).then_some(Diagnosis::OtherMotion { pairs })
 }
 
 /// Diagnoses repeated structures: neighbours that disagree with the model, unless something moves in both (`moving` lists such

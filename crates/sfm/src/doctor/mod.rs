@@ -170,8 +170,10 @@ pub fn diagnose(evidence: &Evidence) -> Vec<Diagnosis> {
     };
     let contradiction =
         consistency::contradiction(evidence, &moving.iter().flat_map(Diagnosis::photos).collect::<Vec<_>>());
+    let other_motion = consistency::other_motion(evidence).into_iter().collect();
     let known = [
         contradiction,
+        other_motion,
         missing::missing(evidence),
         rotation_only,
         motion::rotation_between_models(evidence),

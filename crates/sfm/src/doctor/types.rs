@@ -41,7 +41,7 @@ pub enum Kind {
     Moving,
     /// [`Diagnosis::Duplicate`]
     Duplicate,
-    /// [`Diagnosis::Contradiction`]
+    /// [`Diagnosis::Contradiction`] and [`Diagnosis::OtherMotion`]
     Contradiction,
     /// [`Diagnosis::Missing`]
     Missing,
@@ -243,6 +243,11 @@ pub enum Diagnosis {
         /// Number of verified pairs whose photographs are in the model.
         total: usize,
     },
+    /// Most pairs that show depth moved otherwise than in the model, which may fit only a plane.
+    OtherMotion {
+        /// These pairs.
+        pairs: Vec<[usize; 2]>,
+    },
     /// Photographs without a match to others from nearly the same place.
     Missing {
         /// The pair with the most points that should be matched.
@@ -283,7 +288,7 @@ impl Diagnosis {
             Diagnosis::StillRegion { .. } => Kind::StillRegion,
             Diagnosis::Moving { .. } => Kind::Moving,
             Diagnosis::Duplicate { .. } => Kind::Duplicate,
-            Diagnosis::Contradiction { .. } => Kind::Contradiction,
+            Diagnosis::Contradiction { .. } | Diagnosis::OtherMotion { .. } => Kind::Contradiction,
             Diagnosis::Missing { .. } => Kind::Missing,
             Diagnosis::LeftOut { .. } => Kind::LeftOut,
         }
@@ -314,7 +319,9 @@ impl Diagnosis {
             | Diagnosis::OpenLoop { ends, .. }
             | Diagnosis::RotationBetweenModels { ends, .. }
             | Diagnosis::OwnFocals { ends, .. } => ends.to_vec(),
-            Diagnosis::Contradiction { pairs, .. } => pairs.iter().flatten().copied().collect(),
+            Diagnosis::Contradiction { pairs, .. } | Diagnosis::OtherMotion { pairs } => {
+                pairs.iter().flatten().copied().collect()
+            }
         }
     }
 
@@ -567,6 +574,14 @@ impl Display for Sentence<'_> {
                 name(&pairs[0][0]),
                 name(&pairs[0][1]),
                 100.0 * agreement
+            ),
+            Diagnosis::OtherMotion { pairs } => write!(
+                f,
+                "most pairs that show depth ({}, such as {} and {}) moved otherwise than in the model: it may fit only a plane, such as \
+                 the ground, and what stands on it would be blurred; take photographs nearer to what stands out, and from the side",
+                pairs.len(),
+                name(&pairs[0][0]),
+                name(&pairs[0][1])
             ),
             Diagnosis::Missing {
                 first: [a, b],

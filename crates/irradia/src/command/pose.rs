@@ -209,7 +209,7 @@ pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses, anywa
 }
 
 /// The folder that contains the photographs of a dataset.
-fn photo_folder(input: &TrainInput) -> PathBuf {
+pub fn photo_folder(input: &TrainInput) -> PathBuf {
     match &input.reading.images {
         Some(images) => images.clone(),
         // A file that describes the dataset.

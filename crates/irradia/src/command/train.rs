@@ -1,7 +1,7 @@
 //! `irradia train`
 
 use super::lpips::{self, lpips_path, unseen_lpips_path};
-use super::pose::{Poses, is_unposed, mostly_unposed, pose_again, pose_all, pose_first};
+use super::pose::{Poses, is_unposed, mostly_unposed, photo_folder, pose_again, pose_all, pose_first};
 use super::progress::{Progress, format_size};
 use super::size::memory_size;
 use super::view::ListenArgs;
@@ -9,10 +9,10 @@ use super::{DataArgs, thread_count, use_threads, warn, with_option_names};
 use crate::Usage;
 use crate::interrupt::stop_flag;
 use crate::terminal::{note, one_line, print_line};
-use anyhow::{Result, anyhow, ensure};
+use anyhow::{Error, Result, anyhow, ensure};
 use clap::builder::RangedU64ValueParser;
 use irradia_compute::DeviceChoice;
-use irradia_runs::formats::DatasetFormat;
+use irradia_runs::formats::{DatasetFormat, FormatError};
 use irradia_runs::scene::Dataset;
 use irradia_runs::{
     Background, DEFAULT_RECIPE, Finished, NOT_MEASURED, PoseCheck, PoseSource, Reading, Run, RunError, RunFolder,
@@ -305,7 +305,7 @@ fn with_poses_of(from: &Path, mut input: TrainInput, poses: Option<PosesArg>) ->
 /// The dataset of `input`, whose photographs have poses: with the given poses, or with new ones if they are requested, the photographs
 /// contradict the given ones, or most photographs have none.
 fn with_poses(input: TrainInput, poses: Option<PosesArg>, anyway: bool) -> Result<(TrainRequest, Dataset)> {
-    let mut given = read(input.clone())?;
+    let mut given = read(input.clone()).map_err(|error| naming_photographs(error, &input))?;
     RunFolder::check_free(&input.out, input.overwrite)?;
     // Rendered scenes are exact, and our own poses have been checked.
     let is_sure = is_rendered(&given.1) || pose_source(&input.data) == Some(PoseSource::Irradia);
@@ -374,6 +374,26 @@ fn with_poses(input: TrainInput, poses: Option<PosesArg>, anyway: bool) -> Resul
             Ok(given)
         }
     }
+}
+
+/// `error` of reading the dataset of `input`, with what to do if it has photographs but no usable poses.
+fn naming_photographs(error: Error, input: &TrainInput) -> Error {
+    let photographs = photo_folder(input).join("images");
+    let has_no_poses = matches!(
+        error.downcast_ref(),
+        Some(RunError::Format(
+            FormatError::TooFewViews { .. } | FormatError::Malformed { .. }
+        ))
+    );
+    if !(has_no_poses && is_unposed(&photographs)) {
+        return error;
+    }
+    let message = format!(
+        "{error}; for new poses of its photographs: irradia train {} --out {}",
+        photographs.display(),
+        input.out.display()
+    );
+    anyhow!(message)
 }
 
 /// The dataset of `input` with new poses of the photographs `files`, of which its own has poses of `posed`, if at least twice as many are

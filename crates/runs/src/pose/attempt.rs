@@ -27,6 +27,8 @@ pub(super) struct Matched<'a> {
     /// The photographs that have features, as the mapper needs them.
     pub infos: Vec<PhotoInfo>,
     pub pairs: Vec<PairMatches>,
+    /// Whether what stands still is masked: some still features remain at the edges of the masks, and their matches are removed.
+    pub masked: bool,
 }
 
 /// The result of one attempt.
@@ -36,8 +38,7 @@ pub(super) struct Attempt<'a> {
 }
 
 impl<'a> Matched<'a> {
-    /// Finds features and matches of the photographs of `work`. If what stands still is `masked`, some still features remain at the edges
-    /// of the masks: their matches are removed.
+    /// Finds features and matches of the photographs of `work`.
     pub fn find(mut work: Work<'a>, capture: &Capture, masked: bool, clock: &mut StageTimer) -> Result<Self, RunError> {
         work.find_features()?;
         clock.end("features");
@@ -45,13 +46,25 @@ impl<'a> Matched<'a> {
             successors: if capture.has_films { FILM_SUCCESSORS } else { 0 },
             ..PairOptions::default()
         };
-        let mut pairs = work.match_pairs(&pair_options)?;
+        let pairs = work.match_pairs(&pair_options)?;
         clock.end("matches");
         let infos = capture.infos(work.photos());
-        if masked {
-            pairs = moving_matches(&infos, work.features(), &pairs);
-        }
-        Ok(Self { work, infos, pairs })
+        let mut matched = Self {
+            work,
+            infos,
+            pairs: Vec::new(),
+            masked,
+        };
+        matched.set_pairs(pairs);
+        Ok(matched)
+    }
+
+    fn set_pairs(&mut self, pairs: Vec<PairMatches>) {
+        self.pairs = if self.masked {
+            moving_matches(&self.infos, self.work.features(), &pairs)
+        } else {
+            pairs
+        };
     }
 
     /// Models of the photographs, or poses for those that are not `known`.
@@ -62,8 +75,7 @@ impl<'a> Matched<'a> {
         clock: &mut StageTimer,
         progress: &(dyn Fn(PoseProgress) + Sync),
     ) -> Result<Attempt<'a>, RunError> {
-        let Self { work, infos, pairs } = &mut self;
-        let of = work.photos().len();
+        let of = self.work.photos().len();
         let begin = || progress(PoseProgress::Stage { name: "poses", of });
         begin();
         let mut on_progress = |event| {
@@ -73,21 +85,24 @@ impl<'a> Matched<'a> {
         };
         let is_new = known.is_none();
         let mut reconstruction = match known {
-            None => models(work, infos, pairs, options, &mut on_progress),
+            None => models(&self, options, &mut on_progress),
             Some(known) => {
+                let Self { work, infos, pairs, .. } = &mut self;
                 let known = known.geometry_of(infos)?;
                 extend(infos, work.features(), pairs, &known, options, &mut on_progress)
             }
         };
-        let unmatched = reconstruction.missing_and_unmatched(pairs);
+        let unmatched = reconstruction.missing_and_unmatched(&self.pairs);
         if is_new && !unmatched.is_empty() {
             // With many photographs, not all pairs are matched at first: if too many matches are absent, the remaining pairs are matched
             // as well.
-            let mut all: Vec<[u32; 2]> = pairs.iter().map(|pair| pair.photos).chain(unmatched).collect();
+            let matched = self.pairs.iter().map(|pair| pair.photos);
+            let mut all: Vec<[u32; 2]> = matched.chain(unmatched).collect();
             all.sort_unstable();
-            *pairs = work.matches_of(all)?;
+            let pairs = self.work.matches_of(all)?;
+            self.set_pairs(pairs);
             begin();
-            reconstruction = models(work, infos, pairs, options, &mut on_progress);
+            reconstruction = models(&self, options, &mut on_progress);
         }
         clock.end("poses");
         Ok(Attempt {
@@ -172,13 +187,8 @@ fn min_registered(photos: usize) -> usize {
 /// added. If the model contains half of the photographs, these weak matches might break it, so they only register photographs without a
 /// pose: mapping everything again took 195 s for 201 frames of a copier, 145 of them with a pose, and gave twelve models of 23 to 65
 /// frames, none of which was used. Narrow views are tried in the first attempt only.
-fn models(
-    work: &Work,
-    infos: &[PhotoInfo],
-    pairs: &[PairMatches],
-    options: &MapOptions,
-    on_progress: &mut dyn FnMut(Progress),
-) -> Reconstruction {
+fn models(matched: &Matched, options: &MapOptions, on_progress: &mut dyn FnMut(Progress)) -> Reconstruction {
+    let Matched { work, infos, pairs, .. } = matched;
     let is_second = work.sift().frontal;
     let unguided = MapOptions {
         narrow: options.narrow && !is_second,

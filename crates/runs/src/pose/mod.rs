@@ -457,11 +457,13 @@ impl Posing<'_> {
         let (input, out) = (self.input, &self.input.out);
         let folder = masked.map_or(&self.capture.folder, |masked| &masked.folder);
         let Attempt {
-            matched: Matched {
-                mut work,
-                mut infos,
-                pairs,
-            },
+            matched:
+                Matched {
+                    mut work,
+                    mut infos,
+                    pairs,
+                    ..
+                },
             mut reconstruction,
         } = attempt;
         reconstruction.regroup(&mut infos);

@@ -132,7 +132,9 @@ fn motion_near_prediction(points: &[[DVec2; 2]], predicted: DQuat, seed: u64) ->
 
 /// Diagnoses a model that grew from a motion that fits only a plane.
 pub(super) fn other_motion(evidence: &Evidence) -> Option<Diagnosis> {
-    let found = contradicted_pairs(evidence.pairs, &evidence.model()?.poses);
+    let model = evidence.model()?;
+    let camera_of = |photo: u32| model.cameras[evidence.photos[photo as usize].group].as_ref();
+    let found = contradicted_pairs(evidence.features, evidence.pairs, &model.poses, camera_of);
     let pairs: Vec<[usize; 2]> = (found.iter())
         .map(|i| evidence.pairs[*i].photos.map(|photo| photo as usize))
         .collect();

@@ -12,7 +12,7 @@ use std::collections::BTreeSet;
 /// Maximum number of matches of a pair that are examined.
 const MAX_EXAMINED_MATCHES: usize = 100;
 /// Maximum error of a match that agrees, on the plane z = 1: about eight pixels at the usual focal length.
-const MAX_INLIER_ERROR_ON_PLANE: f64 = 0.01;
+pub(super) const MAX_INLIER_ERROR_ON_PLANE: f64 = 0.01;
 /// A pair agrees with the model if more than this fraction of its matches do, and contradicts it if less than the second does.
 const MIN_AGREEING_FRACTION: f64 = 0.5;
 const MIN_CONSISTENT_FRACTION: f64 = 0.3;

@@ -65,7 +65,10 @@ pub(super) fn grow_model<'a>(
     let empty = GrowingModel::new(photos, cameras, tracks, options);
     let guessed_focals = empty.has_guessed_focals();
     let few = photos.len() <= FEW_PHOTOS;
-    let is_contradicted = |model: &GrowingModel| !contradicted_pairs(pairs, &model.poses).is_empty();
+    let is_contradicted = |model: &GrowingModel| {
+        let camera_of = |photo| Some(model.camera(photo));
+        !contradicted_pairs(input.features, pairs, &model.poses, camera_of).is_empty()
+    };
     // Whether the model must also explain enough observations.
     let is_doubtful =
         |model: &GrowingModel| guessed_focals || few || model.is_far_from_initial_focals() || is_contradicted(model);

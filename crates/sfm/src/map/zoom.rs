@@ -77,8 +77,7 @@ pub(super) fn split_cameras(
         let lens = found.cameras[zoom.previous_group].camera;
         cameras.push(None);
         for (group, focal) in [zoom.previous_group, zoom.group].into_iter().zip(zoom.focals) {
-            let camera = GroupCamera::centered(lens.width, lens.height, focal, FocalSource::Pairs);
-            cameras[group] = Some(camera);
+            cameras[group] = Some(lens_like(&lens, [lens.width, lens.height], focal, FocalSource::Pairs));
         }
         let input = Unverified {
             photos: &grouped,
@@ -103,13 +102,9 @@ fn with_own_focals(
 ) -> Option<Reconstruction> {
     let shared = found.models.first()?;
     let shared_camera = |photo: &PhotoInfo| {
-        let focal = shared.cameras[photo.group].as_ref()?.focal();
-        Some(GroupCamera::centered(
-            photo.width,
-            photo.height,
-            focal,
-            FocalSource::Guess,
-        ))
+        let lens = shared.cameras[photo.group].as_ref()?;
+        let size = [photo.width, photo.height];
+        Some(lens_like(lens, size, lens.focal(), FocalSource::Guess))
     };
     let cameras: Vec<_> = input.photos.iter().map(shared_camera).collect();
     let each = input.photos.iter().cloned().enumerate();
@@ -126,6 +121,13 @@ fn with_own_focals(
         own_focals: true,
         ..own
     })
+}
+
+/// A camera with a focal length of its own, a fisheye if `lens` is one.
+fn lens_like(lens: &DCamera, [width, height]: [u32; 2], focal: f64, source: FocalSource) -> GroupCamera {
+    let mut of = GroupCamera::centered(width, height, focal, source);
+    of.camera.fisheye = lens.fisheye;
+    of
 }
 
 /// How the focal lengths of a model's photographs are distributed.

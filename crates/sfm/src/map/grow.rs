@@ -65,15 +65,11 @@ pub(super) fn grow_model<'a>(
     let empty = GrowingModel::new(photos, cameras, tracks, options);
     let guessed_focals = empty.has_guessed_focals();
     let few = photos.len() <= FEW_PHOTOS;
-    let is_contradicted = |model: &GrowingModel| {
-        let camera_of = |photo| Some(model.camera(photo));
-        !contradicted_pairs(input.features, pairs, &model.poses, camera_of).is_empty()
-    };
     // Whether the model must also explain enough observations.
     let is_doubtful =
-        |model: &GrowingModel| guessed_focals || few || model.is_far_from_initial_focals() || is_contradicted(model);
+        |grown: &Grown| guessed_focals || few || grown.model.is_far_from_initial_focals() || grown.is_contradicted;
     let mut is_any_doubtful = guessed_focals || few;
-    let mut best: Option<GrowingModel> = None;
+    let mut best: Option<Grown> = None;
     let mut outcomes: Vec<SeedOutcome> = Vec::new();
     let mut seeds_left = MAX_SEEDS;
     for seed in seeds(pairs, assigned, MAX_SEED_CANDIDATES) {
@@ -92,55 +88,71 @@ pub(super) fn grow_model<'a>(
         let reachable = reachable(&pairs[seed], pairs, assigned);
         if best
             .as_ref()
-            .is_some_and(|best| best.registered() >= reachable && !is_doubtful(best))
+            .is_some_and(|best| best.model.registered() >= reachable && !is_doubtful(best))
         {
             continue;
         }
-        let mut grown = empty.clone();
-        if !grown.initialize(&pairs[seed]) || !grown.grow(assigned, progress) {
+        let mut model = empty.clone();
+        if !model.initialize(&pairs[seed]) || !model.grow(assigned, progress) {
             continue;
         }
         // If photographs were cropped off centre, no seed explains more while principal points are held at the centre: fox, with each
         // photograph cropped at a different position, took all seeds and 88 s to be mapped, and now takes 9 s.
-        if guessed_focals && grown.explained_fraction() <= MIN_EXPLAINED_FRACTION {
-            let mut free = grown.clone();
+        if guessed_focals && model.explained_fraction() <= MIN_EXPLAINED_FRACTION {
+            let mut free = model.clone();
             free.free_principal_points();
             free.refine_fully(progress);
             free.grow(assigned, progress);
-            if free.explained_fraction() > MIN_EXPLAINED_FRACTION && free.registered() >= grown.registered() {
-                grown = free;
+            if free.explained_fraction() > MIN_EXPLAINED_FRACTION && free.registered() >= model.registered() {
+                model = free;
             }
         }
+        let grown = Grown::new(model, input, pairs);
         let doubtful = is_doubtful(&grown);
-        outcomes.push(SeedOutcome::new(&grown, doubtful));
+        outcomes.push(SeedOutcome::new(&grown.model, doubtful));
         is_any_doubtful |= doubtful;
         // The motion that only fits the ground may explain more than the right one, by bending the lens: 198,154 and 191,558 observations.
-        let size = |model: &GrowingModel| {
+        let size = |grown: &Grown| {
             let count = if is_any_doubtful {
-                model.used_count()
+                grown.model.used_count()
             } else {
-                model.registered()
+                grown.model.registered()
             };
-            (!is_contradicted(model), count)
+            (!grown.is_contradicted, count)
         };
-        if grown.registered() >= options.min_model_photos && best.as_ref().is_none_or(|best| size(&grown) > size(best))
-        {
+        let is_large = grown.model.registered() >= options.min_model_photos;
+        if is_large && best.as_ref().is_none_or(|best| size(&grown) > size(best)) {
             best = Some(grown);
         }
-        let is_sufficient = |best: &GrowingModel| {
-            2 * best.registered() > reachable
-                && !is_contradicted(best)
-                && (!is_doubtful(best) || best.explained_fraction() > MIN_EXPLAINED_FRACTION)
+        let is_sufficient = |best: &Grown| {
+            2 * best.model.registered() > reachable
+                && !best.is_contradicted
+                && (!is_doubtful(best) || best.model.explained_fraction() > MIN_EXPLAINED_FRACTION)
         };
         if best.as_ref().is_some_and(is_sufficient) {
             break;
         }
     }
-    let best = best?;
+    let best = best?.model;
     for (total, failed) in failed_registrations.iter_mut().zip(&best.failures) {
         *total += failed;
     }
     Some(best)
+}
+
+/// A model grown from a seed.
+struct Grown<'a> {
+    model: GrowingModel<'a>,
+    /// Whether most of its pairs contradict it.
+    is_contradicted: bool,
+}
+
+impl<'a> Grown<'a> {
+    fn new(model: GrowingModel<'a>, input: &Input, pairs: &[VerifiedPair]) -> Self {
+        let camera_of = |photo| Some(model.camera(photo));
+        let is_contradicted = !contradicted_pairs(input.features, pairs, &model.poses, camera_of).is_empty();
+        Self { model, is_contradicted }
+    }
 }
 
 /// The model to which a seed led.

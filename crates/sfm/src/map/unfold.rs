@@ -92,21 +92,29 @@ pub(super) fn unfold(input: &Input, found: GrownModels, progress: &mut dyn FnMut
     if found.contradicting < rules.min_contradictions {
         return found.grown;
     }
-    let mut grow_from = |keep: &[bool]| {
-        let kept = pairs.iter().zip(keep).filter(|(_, keep)| **keep);
+    // Most skeletons of a capture extend to the same pairs, which need not be mapped twice.
+    let mut tried: Vec<Vec<bool>> = Vec::new();
+    let mut grow_from = |keep: Vec<bool>| {
+        if tried.contains(&keep) {
+            return None;
+        }
+        let kept = pairs.iter().zip(&keep).filter(|(_, keep)| **keep);
         let kept: Vec<VerifiedPair> = kept.map(|(pair, _)| pair.clone()).collect();
-        evaluate(grow_models(input, &kept, progress))
+        tried.push(keep);
+        Some(evaluate(grow_models(input, &kept, progress)))
     };
     let min_registered = rules.min_registered_ratio * found.registered() as f64;
     let mut best: Option<Candidate> = None;
     for hops in rules.hops {
-        let skeleton = grow_from(&near_in_tree(photos.len(), pairs, &tree, *hops));
+        let Some(skeleton) = grow_from(near_in_tree(photos.len(), pairs, &tree, *hops)) else {
+            continue;
+        };
         let agrees = skeleton
             .agreement
             .iter()
             .map(|a| a.is_none_or(|fraction| fraction > MIN_AGREEMENT));
-        let extended = grow_from(&agrees.collect::<Vec<bool>>());
-        for other in [extended, skeleton] {
+        let extended = grow_from(agrees.collect());
+        for other in extended.into_iter().chain([skeleton]) {
             let is_acceptable =
                 other.registered() as f64 >= min_registered && 2 * other.contradicting <= found.contradicting;
             let has_more_support = |best: &Candidate| other.support(&strengths) > best.support(&strengths);

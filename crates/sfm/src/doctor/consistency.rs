@@ -7,7 +7,8 @@ use super::{Diagnosis, Evidence, GlobalRotations, average_rotations};
 use crate::Features;
 use crate::geometry::essential::{Motion, refine_motion};
 use crate::map::{
-    GroupCamera, PhotoInfo, VerifiedPair, agreement, contradicted_pairs, contradictions, normalized_matches, strengths,
+    GroupCamera, PhotoInfo, VerifiedPair, agreement, contradicted_pairs, contradictions, explains_matches,
+    normalized_matches, strengths,
 };
 use glam::{DQuat, DVec2};
 use irradia_scene::Rng;
@@ -134,7 +135,8 @@ fn motion_near_prediction(points: &[[DVec2; 2]], predicted: DQuat, seed: u64) ->
 pub(super) fn other_motion(evidence: &Evidence) -> Option<Diagnosis> {
     let model = evidence.model()?;
     let camera_of = |photo: u32| model.cameras[evidence.photos[photo as usize].group].as_ref();
-    let found = contradicted_pairs(evidence.features, evidence.pairs, &model.poses, camera_of);
+    let is_reliable = |pair: &VerifiedPair| explains_matches(pair, evidence.features, pair.photos.map(camera_of));
+    let found = contradicted_pairs(evidence.pairs, &model.poses, is_reliable);
     let pairs: Vec<[usize; 2]> = (found.iter())
         .map(|i| evidence.pairs[*i].photos.map(|photo| photo as usize))
         .collect();

@@ -16,8 +16,8 @@ const MAX_DIRECTION_ERROR: f64 = 0.5;
 /// Minimum number of pairs that show depth, and of the matches of each, for a judgement.
 const MIN_JUDGED_PAIRS: usize = 10;
 const MIN_JUDGED_MATCHES: usize = 30;
-/// Minimum fraction of a pair's matches that its motion explains with the cameras of the model: a motion that was found with another focal
-/// length says nothing. In the film it is 0.99 to 1.00; for twelve photographs of a fox, whose guessed focal length was half of the right
+/// Minimum fraction of a pair's matches that its motion explains with the cameras of a grown model: a motion that was found with another
+/// focal length says nothing. In the film it is 0.99 to 1.00; for twelve photographs of a fox, whose guessed focal length was half of the right
 /// one, 0.01 to 0.76, and these motions contradict the right model.
 const MIN_OWN_FRACTION: f64 = 0.9;
 
@@ -31,27 +31,28 @@ pub(super) fn agrees_with(poses: &[Option<DPose>], pair: &VerifiedPair) -> Optio
     Some(turns_alike || direction.angle_between(pair.motion.translation) < MAX_DIRECTION_ERROR)
 }
 
-/// If most of the `pairs` that show depth, and whose photographs both have `poses`, have other motions than these: the indices of those
-/// that do. `camera_of` gives the camera of a photograph with a pose.
-pub fn contradicted_pairs<'a>(
-    features: &[Features],
+/// Whether the motion of `pair` explains its matches with the cameras of a model, which may differ from those with which it was found.
+pub(crate) fn explains_matches(pair: &VerifiedPair, features: &[Features], cameras: [Option<&DCamera>; 2]) -> bool {
+    let [Some(a), Some(b)] = cameras else {
+        return false;
+    };
+    let points = normalized_matches(pair, features, [a, b]);
+    pair.motion.agreeing_fraction(&points, MAX_INLIER_ERROR_ON_PLANE) >= MIN_OWN_FRACTION
+}
+
+/// If most of the `pairs` that show depth, whose photographs both have `poses`, and that are reliable, have other motions than these: the
+/// indices of those that do.
+pub fn contradicted_pairs(
     pairs: &[VerifiedPair],
     poses: &[Option<DPose>],
-    camera_of: impl Fn(u32) -> Option<&'a DCamera>,
+    is_reliable: impl Fn(&VerifiedPair) -> bool,
 ) -> Vec<usize> {
-    let is_explained = |pair: &VerifiedPair| {
-        let [Some(a), Some(b)] = pair.photos.map(&camera_of) else {
-            return false;
-        };
-        let points = normalized_matches(pair, features, [a, b]);
-        pair.motion.agreeing_fraction(&points, MAX_INLIER_ERROR_ON_PLANE) >= MIN_OWN_FRACTION
-    };
     let judged = pairs
         .iter()
         .enumerate()
         .filter(|(_, pair)| pair.kind == PairKind::General && pair.matches.len() >= MIN_JUDGED_MATCHES);
     let (agreeing, contradicted): (Vec<_>, Vec<_>) = judged
-        .filter_map(|(i, pair)| Some((i, agrees_with(poses, pair)?)).filter(|_| is_explained(pair)))
+        .filter_map(|(i, pair)| Some((i, agrees_with(poses, pair)?)).filter(|_| is_reliable(pair)))
         .partition(|(_, agrees)| *agrees);
     let is_judged = agreeing.len() + contradicted.len() >= MIN_JUDGED_PAIRS;
     if is_judged && contradicted.len() > agreeing.len() {
@@ -101,8 +102,8 @@ mod tests {
             },
             angle: 0.1,
         };
-        let contradicted =
-            |pairs: &[VerifiedPair]| contradicted_pairs(&features, pairs, &poses, |_| Some(&camera)).len();
+        let is_reliable = |pair: &VerifiedPair| explains_matches(pair, &features, [Some(&camera); 2]);
+        let contradicted = |pairs: &[VerifiedPair]| contradicted_pairs(pairs, &poses, is_reliable).len();
         let pairs = |wrong: u32, kind: PairKind| -> Vec<VerifiedPair> {
             (0..19)
                 .map(|i| pair(i, kind, if i < wrong { 0.3 } else { 0.1 }))
@@ -124,5 +125,6 @@ mod tests {
             };
         });
         assert_eq!(contradicted(&unexplained), 0, "motions that explain nothing");
+        assert_eq!(contradicted_pairs(&unexplained, &poses, |_| true).len(), 17);
     }
 }

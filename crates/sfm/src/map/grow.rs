@@ -1,7 +1,7 @@
 //! Growing a model from a seed, photograph by photograph.
 
 use super::Input;
-use super::contradicted::{agrees_with, contradicted_pairs};
+use super::contradicted::{agrees_with, contradicted_pairs, explains_matches};
 use super::focal::{FocalSource, are_similar};
 use super::model::GrowingModel;
 use super::refine::Extent;
@@ -149,8 +149,11 @@ struct Grown<'a> {
 
 impl<'a> Grown<'a> {
     fn new(model: GrowingModel<'a>, input: &Input, pairs: &[VerifiedPair]) -> Self {
-        let camera_of = |photo| Some(model.camera(photo));
-        let is_contradicted = !contradicted_pairs(input.features, pairs, &model.poses, camera_of).is_empty();
+        let is_reliable = |pair: &VerifiedPair| {
+            let cameras = pair.photos.map(|photo| Some(model.camera(photo)));
+            explains_matches(pair, input.features, cameras)
+        };
+        let is_contradicted = !contradicted_pairs(pairs, &model.poses, is_reliable).is_empty();
         Self { model, is_contradicted }
     }
 }

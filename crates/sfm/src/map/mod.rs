@@ -36,6 +36,7 @@ mod zoom;
 pub(crate) use agreement::normalized_matches;
 pub use agreement::{agreement, agrees, contradictions, evidence_pairs, strengths};
 pub use contradicted::contradicted_pairs;
+pub(crate) use contradicted::explains_matches;
 pub use distance::{Distance, DistanceFit, scale_to_distances};
 pub use focal::FocalSource;
 pub use fold::folded_pairs;

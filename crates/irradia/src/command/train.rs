@@ -309,17 +309,19 @@ fn with_poses(input: TrainInput, poses: Option<PosesArg>, anyway: bool) -> Resul
     RunFolder::check_free(&input.out, input.overwrite)?;
     // Rendered scenes are exact, and our own poses have been checked.
     let is_sure = is_rendered(&given.1) || pose_source(&input.data) == Some(PoseSource::Irradia);
-    let unposed = mostly_unposed(&input, &given.1).filter(|_| !is_sure);
-    match (poses.map(PosesArg::mapper), unposed) {
+    match (poses.map(PosesArg::mapper), mostly_unposed(&input, &given.1)) {
         (Some(Some(mapper)), unposed) => {
             let mut again = input;
             match unposed {
-                Some(files) => drop(pose_all(&mut again, Some(files), mapper, anyway)?),
+                Some(files) => {
+                    pose_all(&mut again, Some(files), mapper, anyway)?;
+                }
                 None => pose_again(&mut again, &given.1, mapper, anyway)?,
             }
             return read(again);
         }
         (Some(None), _) => return Ok(given),
+        (None, _) if is_sure => return Ok(given),
         (None, Some(files)) => {
             let posed = given.1.views.len();
             let line = format!("only {posed} of {} photographs have poses", files.len());
@@ -338,7 +340,6 @@ fn with_poses(input: TrainInput, poses: Option<PosesArg>, anyway: bool) -> Resul
                 }
             }
         }
-        (None, None) if is_sure => return Ok(given),
         (None, None) => {}
     }
     let found = check(&input)?;

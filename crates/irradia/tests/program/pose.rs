@@ -101,6 +101,10 @@ fn photographs_of_which_most_have_no_poses_get_new_ones() {
     let request = "train door --out again --steps 2 --max-side 120 --poses irradia";
     irradia(folder.path(), request).success();
     assert_eq!(json(&folder.path().join("again/posed/pose.json"))["registered"], 12);
+    let two = json!({ "camera_angle_x": 0.9, "frames": [frame(1), frame(2)] });
+    fs::write(folder.path().join("door/transforms.json"), two.to_string()).expect("written");
+    let named = ["2 usable views", "irradia train door/images --out few"];
+    irradia(folder.path(), "train door --out few").refused(1, &named);
 }
 
 /// The layout of Blender scenes, with opaque photographs, some of them in two folders.

@@ -17,8 +17,8 @@ const MAX_DIRECTION_ERROR: f64 = 0.5;
 const MIN_JUDGED_PAIRS: usize = 10;
 const MIN_JUDGED_MATCHES: usize = 30;
 /// Minimum fraction of a pair's matches that its motion explains with the cameras of a grown model: a motion that was found with another
-/// focal length says nothing. In the film it is 0.99 to 1.00; for twelve photographs of a fox, whose guessed focal length was half of the right
-/// one, 0.01 to 0.76, and these motions contradict the right model.
+/// focal length says nothing. In the film it is 0.99 to 1.00; for twelve photographs of a fox, whose focal length began as a guess, 0.01 to
+/// 0.76, and these motions contradict the right model.
 const MIN_OWN_FRACTION: f64 = 0.9;
 
 /// Whether the motion of `pair` agrees with `poses`; `None` if one of its photographs has none.

@@ -24,6 +24,10 @@ use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 
+/// Maximum number of photographs that are posed without a request if most have no poses, equal to the maximum number of frames chosen from
+/// films: they take a few minutes. Of more, such as all frames of a film, the others may have been left out on purpose.
+const MAX_POSED_UNREQUESTED: usize = 300;
+
 #[derive(clap::Args)]
 pub struct Args {
     /// Folder of posed photographs (COLMAP, nerfstudio, Blender, LLFF, OpenSfM, Metashape, ..), or photographs or a film without
@@ -323,21 +327,8 @@ fn with_poses(input: TrainInput, poses: Option<PosesArg>, anyway: bool) -> Resul
         (Some(None), _) => return Ok(given),
         (None, _) if is_sure => return Ok(given),
         (None, Some(files)) => {
-            let posed = given.1.views.len();
-            let line = format!("only {posed} of {} photographs have poses", files.len());
-            note(format_args!(
-                "{line}: finding new ones; --poses given keeps the given ones"
-            ));
-            match pose_others(input.clone(), posed, files) {
-                Ok((request, mut dataset)) => {
-                    let line = format!("{line}: new ones are used, in a world of their own");
-                    dataset.warnings.push(line);
-                    return Ok((request, dataset));
-                }
-                Err(error) => {
-                    let line = format!("{line}, and they are used after all: {}", one_line(&error));
-                    given.1.warnings.push(line);
-                }
+            if let Some(found) = pose_others(input.clone(), &mut given.1, files) {
+                return Ok(found);
             }
         }
         (None, None) => {}
@@ -397,16 +388,36 @@ fn naming_photographs(error: Error, input: &TrainInput) -> Error {
     anyhow!(message)
 }
 
-/// The dataset of `input` with new poses of the photographs `files`, of which its own has poses of `posed`, if at least twice as many are
-/// found.
-fn pose_others(mut input: TrainInput, posed: usize, files: HashSet<PathBuf>) -> Result<(TrainRequest, Dataset)> {
-    let report = pose_all(&mut input, Some(files), Poses::Irradia, true)?;
-    ensure!(
-        report.registered >= 2 * posed,
-        "new ones were found for {} only",
-        report.registered
-    );
-    read(input)
+/// The dataset of `input` with new poses of the photographs `files`, of which `given` has poses of a minority, if at least twice as many are
+/// found; `None`, with a warning in `given`, if those are used after all.
+fn pose_others(mut input: TrainInput, given: &mut Dataset, files: HashSet<PathBuf>) -> Option<(TrainRequest, Dataset)> {
+    let posed = given.views.len();
+    let line = format!("only {posed} of {} photographs have poses", files.len());
+    if files.len() > MAX_POSED_UNREQUESTED {
+        let line = format!("{line}: --poses irradia finds new ones for all");
+        given.warnings.push(line);
+        return None;
+    }
+    note(format_args!(
+        "{line}: finding new ones; --poses given keeps the given ones"
+    ));
+    let found = pose_all(&mut input, Some(files), Poses::Irradia, true).and_then(|report| {
+        let n = report.registered;
+        ensure!(n >= 2 * posed, "new ones were found for {n} only");
+        read(input)
+    });
+    match found {
+        Ok((request, mut dataset)) => {
+            let line = format!("{line}: new ones are used, in a world of their own");
+            dataset.warnings.push(line);
+            Some((request, dataset))
+        }
+        Err(error) => {
+            let line = format!("{line}, and they are used after all: {}", one_line(&error));
+            given.warnings.push(line);
+            None
+        }
+    }
 }
 
 /// The dataset of `input` with new poses, if the share of pairs that contradict them is less than half of `contradicted`, that of the poses

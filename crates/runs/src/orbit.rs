@@ -232,18 +232,24 @@ mod tests {
         }
     }
 
+    /// Small, mostly opaque splats.
+    fn splats_at(means: Vec<[f32; 3]>) -> Splats {
+        let n = means.len();
+        Splats::from_cloud(&GaussianCloud {
+            means,
+            quats: vec![[1.0, 0.0, 0.0, 0.0]; n],
+            log_scales: vec![[-3.0; 3]; n],
+            opacity_logits: vec![2.0; n],
+            sh: vec![0.0; 3 * n],
+            sh_degree: 0,
+            ..GaussianCloud::default()
+        })
+    }
+
     #[test]
     fn around_a_survey_means_above_its_ground() {
         let ground = (0..400).map(|i| [0.5 * (i % 20) as f32, 0.5 * (i / 20) as f32, 0.0]);
-        let cloud = GaussianCloud {
-            means: ground.collect(),
-            quats: vec![[1.0, 0.0, 0.0, 0.0]; 400],
-            log_scales: vec![[-3.0; 3]; 400],
-            opacity_logits: vec![2.0; 400],
-            sh: vec![0.0; 1200],
-            sh_degree: 0,
-            ..GaussianCloud::default()
-        };
+        let splats = splats_at(ground.collect());
         let camera = |i: usize| {
             let pose = Pose {
                 rotation: Quat::from_rotation_x(std::f32::consts::PI),
@@ -252,7 +258,7 @@ mod tests {
             Camera::new(pose, Intrinsics::from_fov_x(64, 48, 1.0))
         };
         let cameras: Vec<Camera> = (0..20).map(camera).collect();
-        for camera in orbit(Some(&Splats::from_cloud(&cloud)), Some(&cameras), 8, None) {
+        for camera in orbit(Some(&splats), Some(&cameras), 8, None) {
             let forward = camera.pose.rotation * Vec3::Z;
             assert!(
                 camera.pose.position.z > 3.0 && forward.z < -0.5,
@@ -264,17 +270,8 @@ mod tests {
 
     #[test]
     fn cameras_that_turn_away_from_each_other_are_before_the_scene() {
-        let cloud = GaussianCloud {
-            means: (0..100)
-                .map(|i| [0.3 * (i % 10) as f32 - 1.5, 5.0, 0.1 * (i / 10) as f32])
-                .collect(),
-            quats: vec![[1.0, 0.0, 0.0, 0.0]; 100],
-            log_scales: vec![[-3.0; 3]; 100],
-            opacity_logits: vec![2.0; 100],
-            sh: vec![0.0; 300],
-            sh_degree: 0,
-            ..GaussianCloud::default()
-        };
+        let wall = (0..100).map(|i| [0.3 * (i % 10) as f32 - 1.5, 5.0, 0.1 * (i / 10) as f32]);
+        let splats = splats_at(wall.collect());
         // The axes meet behind the cameras.
         let camera = |i: usize| {
             let x = 0.1 * (i as f32 - 4.0);
@@ -283,7 +280,7 @@ mod tests {
         };
         let cameras: Vec<Camera> = (0..9).map(camera).collect();
         assert!(focus_point(&cameras).y < 0.0);
-        let center = orbit_geometry(Some(&Splats::from_cloud(&cloud)), Some(&cameras)).center;
+        let center = orbit_geometry(Some(&splats), Some(&cameras)).center;
         assert!((center - Vec3::new(0.0, 5.0, 0.5)).length() < 0.2, "{center}");
         // Those that look around them orbit their middle.
         let around = ring((0..12).map(|i| 30.0 * i as f32)).into_iter().map(|mut camera| {
@@ -291,7 +288,7 @@ mod tests {
             camera
         });
         let around: Vec<Camera> = around.collect();
-        let center = orbit_geometry(Some(&Splats::from_cloud(&cloud)), Some(&around)).center;
+        let center = orbit_geometry(Some(&splats), Some(&around)).center;
         assert!((center - focus_point(&around)).length() < 1e-4, "{center}");
     }
 }

@@ -25,15 +25,12 @@ pub(super) fn find_image(path: &Path) -> Option<PathBuf> {
     added.chain(replaced).find(|candidate| candidate.is_file())
 }
 
-/// Where the file may be to which a dataset in `root` refers by `name`: there, or at an end of that path below `root`, the longest first,
-/// since datasets are moved and absolute paths are those of another machine.
-pub(super) fn possible_paths(root: &Path, name: &str) -> impl Iterator<Item = PathBuf> {
+/// A path that a dataset names, then its ends, the longest first: datasets are moved, and absolute paths are those of another machine.
+pub(super) fn path_ends(name: &str) -> impl Iterator<Item = PathBuf> {
     let name = PathBuf::from(name.replace('\\', "/"));
-    let ends = (1..name.components().count()).map({
-        let (root, name) = (root.to_owned(), name.clone());
-        move |first| root.join(name.components().skip(first).collect::<PathBuf>())
-    });
-    std::iter::once(root.join(name)).chain(ends)
+    let count = name.components().count();
+    let end = move |first| name.components().skip(first).collect();
+    (0..count).map(end)
 }
 
 /// `path` below `root`, with forward slashes and without `./`.
@@ -122,15 +119,14 @@ pub(super) fn choose_image_folder(root: &Path, downscale: f32) -> Option<ImageFo
     })
 }
 
-/// The photograph `name` of a dataset in one of `folders` below `root`: by its path, or by its file name alone.
+/// The photograph `name` of a dataset in one of `folders` below `root`: by its path, or by the longest of its ends.
 pub(super) fn locate_image(root: &Path, folders: &[&str], name: &str) -> Option<PathBuf> {
-    let file = Path::new(name).file_name()?;
-    let find_in_folders = |name: &Path| {
+    let find_in_folders = |end: PathBuf| {
         folders
             .iter()
-            .find_map(|folder| find_image(&root.join(folder).join(name)))
+            .find_map(|folder| find_image(&root.join(folder).join(&end)))
     };
-    find_in_folders(Path::new(name)).or_else(|| find_in_folders(Path::new(file)))
+    path_ends(name).find_map(find_in_folders)
 }
 
 /// `path` itself if it is a file of that name, or the file `name` in it.

@@ -1,7 +1,7 @@
 //! A folder with one `transforms.json`, as written by nerfstudio and instant-ngp.
 
 use super::declared::{DeclaredDataset, DeclaredView, Split};
-use super::files::{find_image, possible_paths, relative_name};
+use super::files::{locate_image, path_ends, relative_name};
 use super::openmvg;
 use super::transforms::{Frame, Transforms, parse_transforms};
 use crate::FormatError;
@@ -112,8 +112,10 @@ pub(super) fn declared_views(
         }
     };
     // A file beside the photograph, if it exists.
-    let existing_file =
-        |path: &Option<String>| -> Option<PathBuf> { possible_paths(root, path.as_ref()?).find(|path| path.is_file()) };
+    let existing_file = |path: &Option<String>| {
+        let mut paths = path_ends(path.as_ref()?).map(|end| root.join(end));
+        paths.find(|path| path.is_file())
+    };
     transforms
         .frames
         .iter()
@@ -126,7 +128,7 @@ pub(super) fn declared_views(
                     path: file.to_owned(),
                     source,
                 })?;
-            let image = possible_paths(root, &frame.file_path).find_map(|path| find_image(&path));
+            let image = locate_image(root, &[""], &frame.file_path);
             let path = root.join(frame.file_path.replace('\\', "/"));
             Ok(DeclaredView {
                 name: relative_name(root, image.as_deref().unwrap_or(&path)),

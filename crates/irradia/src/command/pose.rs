@@ -133,8 +133,6 @@ pub fn pose_all(
     poses: Poses,
     anyway: bool,
 ) -> Result<PoseReport> {
-    input.data = photo_folder(input);
-    (input.reading.format, input.reading.images) = (None, None);
     let report = pose_into_run(input, poses, only)?;
     let posed = &input.data;
     if report.fraction() < MIN_POSED_FRACTION && !anyway {
@@ -170,8 +168,6 @@ pub fn pose_all(
 /// As [`pose_first`], for photographs whose poses in `dataset` are not used; the same views are held out, left out and trained on. Fails if
 /// no pose is found for a held-out view, or for more than a few of the others, unless `anyway`, which trains on those with poses.
 pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses, anyway: bool) -> Result<()> {
-    input.data = photo_folder(input);
-    (input.reading.format, input.reading.images) = (None, None);
     let names_of = |views: &[usize]| -> Vec<String> {
         let names = views.iter().map(|view| bare_name(&dataset.views[*view].name));
         names.map(str::to_owned).collect()
@@ -185,7 +181,7 @@ pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses, anywa
         ))
         .into());
     }
-    let report = pose_into_run(input, poses, files_of(dataset, &input.data))?;
+    let report = pose_into_run(input, poses, files_of(dataset, &photo_folder(input)))?;
     let left_out: HashSet<&str> = report.left_out.iter().map(|left| bare_name(&left.name)).collect();
     let is_lost = |name: &&String| left_out.contains(name.as_str());
     let held_out: Vec<&str> = test.iter().filter(|name| !is_lost(name)).map(String::as_str).collect();
@@ -257,11 +253,13 @@ fn bare_name(name: &str) -> &str {
 fn pose_into_run(input: &mut TrainInput, poses: Poses, only: Option<HashSet<PathBuf>>) -> Result<PoseReport> {
     let posed = input.out.join(POSED_FOLDER);
     note(format_args!("finding poses, which are written to {}", posed.display()));
-    let data = std::mem::replace(&mut input.data, posed.clone());
+    let photos = photo_folder(input);
+    input.data.clone_from(&posed);
+    (input.reading.format, input.reading.images) = (None, None);
     let request = PoseInput {
         mapper: poses.into(),
         only,
-        ..PoseInput::new(data, &posed)
+        ..PoseInput::new(photos, &posed)
     };
     let report = pose_with_progress(&request)?;
     note(summary(&report));

@@ -312,26 +312,24 @@ fn with_poses(input: TrainInput, poses: Option<PosesArg>, anyway: bool) -> Resul
     let mut given = read(input.clone()).map_err(|error| naming_photographs(error, &input))?;
     RunFolder::check_free(&input.out, input.overwrite)?;
     // Rendered scenes are exact, and our own poses have been checked.
-    let is_sure = is_rendered(&given.1) || pose_source(&input.data) == Some(PoseSource::Irradia);
-    match (poses.map(PosesArg::mapper), mostly_unposed(&input, &given.1)) {
-        (Some(Some(mapper)), unposed) => {
+    let is_sure = || is_rendered(&given.1) || pose_source(&input.data) == Some(PoseSource::Irradia);
+    match poses.map(PosesArg::mapper) {
+        Some(Some(mapper)) => {
             let mut again = input;
-            match unposed {
-                Some(files) => {
-                    pose_all(&mut again, Some(files), mapper, anyway)?;
-                }
+            match mostly_unposed(&again, &given.1) {
+                Some(files) => drop(pose_all(&mut again, Some(files), mapper, anyway)?),
                 None => pose_again(&mut again, &given.1, mapper, anyway)?,
             }
             return read(again);
         }
-        (Some(None), _) => return Ok(given),
-        (None, _) if is_sure => return Ok(given),
-        (None, Some(files)) => {
-            if let Some(found) = pose_others(input.clone(), &mut given.1, files) {
-                return Ok(found);
-            }
-        }
-        (None, None) => {}
+        Some(None) => return Ok(given),
+        None if is_sure() => return Ok(given),
+        None => {}
+    }
+    if let Some(files) = mostly_unposed(&input, &given.1)
+        && let Some(found) = pose_others(input.clone(), &mut given.1, files)
+    {
+        return Ok(found);
     }
     let found = check(&input)?;
     if !found.is_broken() {

@@ -240,6 +240,18 @@ mod tests {
         }
     }
 
+    /// A run from its first recipe step, fitted neither into a number of steps nor into a time.
+    fn whole<'a>(recipe: &'a Recipe, stages: &'a [StageReport], clock: &'a Clock) -> Course<'a> {
+        Course {
+            recipe,
+            stages,
+            clock,
+            skipped: 0.0,
+            steps: None,
+            timed: false,
+        }
+    }
+
     #[test]
     fn a_run_without_early_ends_shows_the_plan() {
         let recipe = recipe("");
@@ -249,12 +261,8 @@ mod tests {
             stage("refine", 101, 200),
         ];
         let schedule = schedule(&Course {
-            recipe: &recipe,
-            stages: &stages,
-            clock: &ended(&recipe),
-            skipped: 0.0,
             steps: Some(200),
-            timed: false,
+            ..whole(&recipe, &stages, &ended(&recipe))
         });
         assert!(schedule.done && schedule.steps.windows(2).all(|w| w[0] <= w[1]));
         assert_eq!(schedule.steps.last(), Some(&200.0));
@@ -298,14 +306,7 @@ mod tests {
             stage("grow", 41, 140),
             stage("refine", 141, 340),
         ];
-        let schedule = schedule(&Course {
-            recipe: &recipe,
-            stages: &stages,
-            clock: &clock,
-            skipped: 0.0,
-            steps: None,
-            timed: false,
-        });
+        let schedule = schedule(&whole(&recipe, &stages, &clock));
         assert!(schedule.done);
         for (step, name, of) in [
             (20.0, "scale.image", truth[20].image_scale),
@@ -333,35 +334,13 @@ mod tests {
             ..Clock::new(&recipe)
         };
         let stages = [stage("warmup", 1, 100), stage("grow", 101, 150)];
-        let half = schedule(&Course {
-            recipe: &recipe,
-            stages: &stages,
-            clock: &clock,
-            skipped: 0.0,
-            steps: None,
-            timed: false,
-        });
+        let course = whole(&recipe, &stages, &clock);
+        let half = schedule(&course);
         assert!(half.done && half.steps.last() == Some(&150.0));
-        assert!(
-            !schedule(&Course {
-                recipe: &recipe,
-                stages: &stages,
-                clock: &clock,
-                skipped: 0.0,
-                steps: None,
-                timed: true
-            })
-            .done
-        );
+        let timed = Course { timed: true, ..course };
+        assert!(!schedule(&timed).done);
         assert_eq!(
-            schedule(&Course {
-                recipe: &recipe,
-                stages: &[],
-                clock: &Clock::new(&recipe),
-                skipped: 0.0,
-                steps: None,
-                timed: false
-            }),
+            schedule(&whole(&recipe, &[], &Clock::new(&recipe))),
             Schedule {
                 done: true,
                 ..Schedule::default()
@@ -378,12 +357,9 @@ mod tests {
             (150.0, 2.5, vec![stage("grow", 1, 15), stage("refine", 16, 75)]),
         ] {
             let schedule = schedule(&Course {
-                recipe: &recipe,
-                stages: &stages,
-                clock: &ended(&recipe),
                 skipped,
                 steps: Some(75),
-                timed: false,
+                ..whole(&recipe, &stages, &ended(&recipe))
             });
             let rates = schedule.knobs.iter().find(|knob| knob.name == "rate.means").unwrap();
             assert!(schedule.done && schedule.steps.windows(2).all(|w| w[0] <= w[1]));

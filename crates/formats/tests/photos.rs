@@ -262,7 +262,10 @@ fn photographs_are_as_read_dataset_decodes_them() {
         save_turned(&images.join(name), &picture(size[0], size[1], 90), orientation);
     }
     let found = read_photo_folder(folder.path()).unwrap();
-    assert_eq!(found.groups(), [0, 1, 1, 0, 2, 2]);
+    assert_eq!(found.groups(), [0, 1, 2, 0, 3, 3]);
+    assert_eq!(found.cameras(), [0, 0, 0, 0, 1, 1]);
+    let turns: Vec<u8> = found.photos.iter().map(|photo| photo.quarter_turns()).collect();
+    assert_eq!(turns, [0, 1, 3, 0, 0, 0]);
     let up: Vec<Option<DVec3>> = found.photos.iter().map(|photo| photo.up).collect();
     let [left, right, under] = [DVec3::NEG_X, DVec3::X, DVec3::Y].map(Some);
     assert_eq!(up, [None, None, None, under, left, right]);

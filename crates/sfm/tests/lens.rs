@@ -6,7 +6,7 @@ use glam::{DVec2, DVec3};
 use irradia_scene::Rng;
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::geometry::pose::DPose;
-use irradia_sfm::map::{FocalSource, GroupCamera, MapOptions, PhotoInfo, verify};
+use irradia_sfm::map::{FocalSource, GroupCamera, MapOptions, Model, PhotoInfo, Turning, reconstruct, verify};
 use world::{CAMERA, World, around, look};
 
 #[test]
@@ -193,4 +193,76 @@ fn narrow_views_all_around_are_one_model() {
     let focal = model.cameras[0].expect("registered").focal() / camera.focal();
     assert!((focal - 1.0).abs() < 0.1, "{focal}");
     assert!(world.auc(model, 5.0) > 80.0, "{}", world.auc(model, 5.0));
+}
+
+/// Each photograph's pixels of the points of the model are where its keypoints are.
+fn assert_points_are_seen(world: &World, photos: &[PhotoInfo], model: &Model) {
+    for point in &model.points {
+        for (photo, keypoint) in &point.track {
+            let (photo, keypoint) = (*photo as usize, *keypoint as usize);
+            let camera = model.cameras[photos[photo].group].expect("a camera");
+            let at = camera.pixel(model.poses[photo].expect("a pose").camera_from_world(point.position));
+            let error = at.distance(world.features[photo].keypoints[keypoint].at());
+            assert!(error < 6.0, "{} {error}", photos[photo].name);
+        }
+    }
+}
+
+#[test]
+fn a_camera_held_level_and_on_its_side_has_one_lens() {
+    const LENS: DCamera = DCamera {
+        parameters: [870.0, 872.0, 500.0, 375.0, 0.06, -0.04, 0.002, -0.001],
+        ..CAMERA
+    };
+    let mut rng = Rng::new(5, 1);
+    let mut direction = || DVec3::from_array([(); 3].map(|()| f64::from(rng.range(-1.0, 1.0))));
+    let points: Vec<(DVec3, DVec3)> = (0..2500)
+        .map(|_| (2.5 * direction(), direction().normalize()))
+        .collect();
+    let level = World::of_points(LENS, around(24, 1.0), &points, 0, 0.5, 0.2, 3);
+    let turns = |photo: usize| match photo {
+        4 | 11 | 16 => 1,
+        20 => 3,
+        _ => 0,
+    };
+    // Those from 15 on are zoomed, level or not.
+    for (world, groups) in [
+        (level.clone().turned(turns), 3),
+        (level.zoomed(15, 1.5).turned(turns), 5),
+    ] {
+        let (mut photos, mut features) = (world.photos.clone(), world.features.clone());
+        let turning = Turning::apply(&mut photos, &mut features);
+        assert!(photos.iter().all(|photo| (photo.width, photo.group) == (1000, 0)));
+        let options = MapOptions::default();
+        let mut found = reconstruct(&photos, &features, &world.pairs, &options, &mut |_| ());
+        turning.undo(&mut photos, &mut features, &mut found, &options, &mut |_| ());
+        assert!(photos == world.photos && features == world.features);
+        let model = &found.models[0];
+        assert_eq!(model.registered(), 24);
+        assert!(world.auc(model, 1.0) > 90.0, "{}", world.auc(model, 1.0));
+        found.regroup(&mut photos);
+        let camera = |zoomed: bool, held: u8| {
+            let mut of = (0..24)
+                .filter(|i| (*i >= 15, turns(*i)) == (zoomed, held))
+                .map(|i| model.cameras[photos[i].group]);
+            let camera = of.next().flatten();
+            assert!(of.all(|other| other == camera));
+            camera
+        };
+        for zoomed in [false, true] {
+            let level = camera(zoomed, 0).expect("level photographs");
+            for (turns, camera) in [1, 3].map(|turns| (turns, camera(zoomed, turns))) {
+                assert!(camera.is_none_or(|camera| camera == level.turned(turns)));
+            }
+        }
+        let present = model.cameras.iter().flatten().count();
+        let of_photos: std::collections::BTreeSet<usize> = photos.iter().map(|photo| photo.group).collect();
+        assert_eq!((present, of_photos.len()), (groups, groups));
+        assert_points_are_seen(&world, &photos, model);
+        for pair in found.pairs.iter().filter(|pair| pair.matches.len() >= 100) {
+            let [a, b] = pair.photos.map(|photo| model.poses[photo as usize].expect("a pose"));
+            let error = pair.motion.rotation.angle_between(b.rotation.inverse() * a.rotation);
+            assert!(error < 0.1, "{:?} {error}", pair.photos);
+        }
+    }
 }

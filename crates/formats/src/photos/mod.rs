@@ -58,6 +58,32 @@ impl PhotoEntry {
         Some(self.tags.focal? * f64::from(self.width.max(self.height)))
     }
 
+    /// By how many clockwise quarter turns, 0 to 3, the decoded image is turned from the camera's sensor, whose width is at least its
+    /// height. Of a portrait whose metadata do not contain its orientation, one is assumed, as of phones held upright.
+    pub fn quarter_turns(&self) -> u8 {
+        match self.orientation {
+            _ if self.width >= self.height => 0,
+            Orientation::Rotate270 => 3,
+            _ => 1,
+        }
+    }
+
+    /// Width and height, px.
+    pub fn size(&self) -> [u32; 2] {
+        [self.width, self.height]
+    }
+
+    /// What the metadata say about the camera. Its focal length is rounded to 0.0001 long sides: the resolution of the sensor, from which it
+    /// may be computed, differs in the last digits between photographs held level and on the side.
+    fn camera_key(&self) -> (&Option<String>, &Option<String>, Option<i64>) {
+        let tags = &self.tags;
+        (
+            &tags.make,
+            &tags.model,
+            tags.focal.map(|focal| (1e4 * focal).round() as i64),
+        )
+    }
+
     /// The pixels, with 3 or 4 channels; a large JPEG is decoded at a half, quarter or eighth of its size if its longer side still has
     /// at least `min_side` pixels.
     ///
@@ -148,24 +174,38 @@ impl PhotoFolder {
         self.left_out.iter().chain(&self.repeated)
     }
 
-    /// The index of each photograph's group: photographs of a group have the same make, model, focal length and size.
+    /// The index of each photograph's group: photographs of a group have the same make, model, focal length, size and quarter turns from
+    /// the sensor.
     pub fn groups(&self) -> Vec<usize> {
-        let mut known = Vec::new();
-        let group = |photo: &PhotoEntry| {
-            let tags = &photo.tags;
-            let key = (
-                tags.make.clone(),
-                tags.model.clone(),
-                tags.focal.map(f64::to_bits),
-                [photo.width, photo.height],
-            );
-            known.iter().position(|other| *other == key).unwrap_or_else(|| {
-                known.push(key);
-                known.len() - 1
-            })
-        };
-        self.photos.iter().map(group).collect()
+        numbered(
+            self.photos
+                .iter()
+                .map(|photo| (photo.camera_key(), photo.size(), photo.quarter_turns())),
+        )
     }
+
+    /// The index of each photograph's camera: photographs of a camera have the same make, model, focal length and, however it was held,
+    /// size.
+    pub fn cameras(&self) -> Vec<usize> {
+        let sorted = |[a, b]: [u32; 2]| [a.min(b), a.max(b)];
+        numbered(
+            self.photos
+                .iter()
+                .map(|photo| (photo.camera_key(), sorted(photo.size()))),
+        )
+    }
+}
+
+/// Numbers equal `keys` equally, from 0 in the order of their first occurrence.
+fn numbered<K: PartialEq>(keys: impl Iterator<Item = K>) -> Vec<usize> {
+    let mut known: Vec<K> = Vec::new();
+    let number = |key: K| {
+        known.iter().position(|other| *other == key).unwrap_or_else(|| {
+            known.push(key);
+            known.len() - 1
+        })
+    };
+    keys.map(number).collect()
 }
 
 /// The photographs in `folder` itself, or else in the first of its subfolders `images`, `images_1`, `images_2`, `images_4` and

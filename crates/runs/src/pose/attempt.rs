@@ -7,7 +7,7 @@ use super::{AttemptReport, MIN_POSED_FRACTION, PoseProgress, StageTimer};
 use crate::RunError;
 use irradia_sfm::PairMatches;
 use irradia_sfm::map::{
-    FEW_PHOTOS, MapOptions, PhotoInfo, Progress, Reconstruction, complete, extend, moving_matches, reconstruct,
+    FEW_PHOTOS, MapOptions, PhotoInfo, Progress, Reconstruction, Turning, complete, extend, moving_matches, reconstruct,
 };
 use irradia_sfm::matching::PairOptions;
 use std::path::Path;
@@ -67,6 +67,20 @@ impl<'a> Matched<'a> {
         };
     }
 
+    /// Models of the photographs, which are turned alike while they are mapped.
+    fn models(&mut self, options: &MapOptions, on_progress: &mut dyn FnMut(Progress)) -> Reconstruction {
+        let turning = Turning::apply(&mut self.infos, self.work.features_mut());
+        let mut found = models(self, options, on_progress);
+        turning.undo(
+            &mut self.infos,
+            self.work.features_mut(),
+            &mut found,
+            options,
+            on_progress,
+        );
+        found
+    }
+
     /// Models of the photographs, or poses for those that are not `known`.
     pub fn map(
         mut self,
@@ -85,7 +99,7 @@ impl<'a> Matched<'a> {
         };
         let is_new = known.is_none();
         let mut reconstruction = match known {
-            None => models(&self, options, &mut on_progress),
+            None => self.models(options, &mut on_progress),
             Some(known) => {
                 let Self { work, infos, pairs, .. } = &mut self;
                 let known = known.geometry_of(infos)?;
@@ -102,7 +116,7 @@ impl<'a> Matched<'a> {
             let pairs = self.work.matches_of(all)?;
             self.set_pairs(pairs);
             begin();
-            reconstruction = models(&self, options, &mut on_progress);
+            reconstruction = self.models(options, &mut on_progress);
         }
         clock.end("poses");
         Ok(Attempt {

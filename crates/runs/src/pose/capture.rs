@@ -10,7 +10,7 @@ use irradia_formats::{
     read_photo_folder, write_atomic,
 };
 use irradia_sfm::geometry::camera::DCamera;
-use irradia_sfm::map::{PhotoInfo, RigMount};
+use irradia_sfm::map::{PhotoInfo, RigMount, Sensor};
 use rayon::prelude::*;
 use std::collections::{HashMap, HashSet};
 use std::fs;
@@ -265,7 +265,7 @@ impl Capture {
 
     /// The mapper's input for the photographs `used`, indices of the folder's photographs.
     pub fn infos(&self, used: &[usize]) -> Vec<PhotoInfo> {
-        let groups = self.folder.groups();
+        let (groups, cameras) = (self.folder.groups(), self.folder.cameras());
         // Groups are numbered from 0 without gaps, even if some photographs could not be decoded.
         let mut numbers: Vec<usize> = Vec::new();
         let info = |i: &usize| {
@@ -281,6 +281,10 @@ impl Capture {
                 width: photo.width,
                 height: photo.height,
                 group,
+                sensor: Some(Sensor {
+                    camera: cameras[*i],
+                    quarter_turns: photo.quarter_turns(),
+                }),
                 focal_prior_px: photo.focal_px(),
                 up: face.map_or(photo.up, |(_, face)| Some(face.rotation.inverse() * DVec3::NEG_Y)),
                 camera: face.map(|(_, face)| DCamera::pinhole(&face.camera)),

@@ -43,8 +43,15 @@ pub(super) fn run(
     stage("features");
     let mut extract = colmap.command("feature_extractor")?;
     extract.path("database_path", &database).path("image_path", &images);
-    let one_camera = folder.groups().iter().all(|group| *group == 0);
-    extract.option(&["ImageReader.single_camera"], if one_camera { "1" } else { "0" });
+    let one_camera = folder.cameras().iter().all(|camera| *camera == 0);
+    let one_size = folder
+        .photos
+        .iter()
+        .all(|photo| photo.size() == folder.photos[0].size());
+    extract.option(
+        &["ImageReader.single_camera"],
+        if one_camera && one_size { "1" } else { "0" },
+    );
     extract.option(
         &["FeatureExtraction.use_gpu", "SiftExtraction.use_gpu"],
         colmap.use_gpu(),

@@ -5,7 +5,7 @@ use glam::{DQuat, DVec3};
 use irradia_formats::{ColmapCamera, ColmapImage, PhotoFolder, SiblingFolder, read_colmap_poses, read_photo_folders};
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::geometry::pose::DPose;
-use irradia_sfm::map::{KnownGeometry, PhotoInfo};
+use irradia_sfm::map::{KnownGeometry, PhotoInfo, Sensor};
 use std::collections::{BTreeSet, HashMap};
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
@@ -95,7 +95,7 @@ impl KnownPoses {
     }
 
     /// The known poses and cameras of `photos`, whose groups are replaced by those of the dataset's cameras: new photographs join the
-    /// camera of photographs with the same metadata.
+    /// camera of photographs with the same metadata, turned if it was held otherwise.
     pub fn geometry_of(&self, photos: &mut [PhotoInfo]) -> Result<KnownGeometry, RunError> {
         let of_photo: Vec<Option<&ColmapImage>> = photos.iter().map(|photo| self.images.get(&photo.name)).collect();
         for (photo, image) in photos.iter().zip(&of_photo) {
@@ -120,23 +120,29 @@ impl KnownPoses {
             }
         }
         let mut camera_of_group: HashMap<usize, u32> = HashMap::new();
+        // The camera of the first photograph of each sensor, and how that was held.
+        let mut camera_of_sensor: HashMap<usize, (u32, u8)> = HashMap::new();
         for (photo, image) in photos.iter().zip(&of_photo) {
             if let Some(image) = image {
                 camera_of_group.entry(photo.group).or_insert(image.camera_id);
+                if let Some(sensor) = photo.sensor {
+                    let first = (image.camera_id, sensor.quarter_turns);
+                    camera_of_sensor.entry(sensor.camera).or_insert(first);
+                }
             }
         }
         // The dataset's cameras by id, then groups of new photographs.
         #[derive(PartialEq)]
         enum Group {
             Camera(u32),
-            New(usize),
+            New(usize, Option<Sensor>),
         }
         let mut groups: Vec<Group> = Vec::new();
         for (photo, image) in photos.iter_mut().zip(&of_photo) {
             let camera = image.map(|image| image.camera_id);
             let group = match camera.or_else(|| camera_of_group.get(&photo.group).copied()) {
                 Some(id) => Group::Camera(id),
-                None => Group::New(photo.group),
+                None => Group::New(photo.group, photo.sensor),
             };
             photo.group = groups.iter().position(|known| *known == group).unwrap_or_else(|| {
                 groups.push(group);
@@ -145,7 +151,12 @@ impl KnownPoses {
         }
         let camera = |group: &Group| match group {
             Group::Camera(id) => self.camera(*id).map(Some),
-            Group::New(_) => Ok(None),
+            Group::New(_, sensor) => {
+                let known = sensor.and_then(|sensor| Some((camera_of_sensor.get(&sensor.camera)?, sensor)));
+                known
+                    .map(|((id, turns), sensor)| Ok(self.camera(*id)?.turned((4 + sensor.quarter_turns - turns) % 4)))
+                    .transpose()
+            }
         };
         Ok(KnownGeometry {
             poses: of_photo.iter().map(|image| image.map(pose)).collect(),

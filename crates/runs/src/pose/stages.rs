@@ -165,6 +165,11 @@ impl<'a> Work<'a> {
         &self.features
     }
 
+    /// For changes that are undone before features and matches are saved.
+    pub fn features_mut(&mut self) -> &mut [Features] {
+        &mut self.features
+    }
+
     /// The colour at each keypoint, by photograph.
     pub fn colors(&self) -> &[Vec<[u8; 3]>] {
         &self.colors

@@ -17,6 +17,9 @@ fn photographs_are_added_to_a_dataset_whose_poses_stay() {
     for (name, _) in later {
         fs::rename(at("photos").join(name), at("more").join(name)).unwrap();
     }
+    // One is a portrait.
+    let portrait = at("more").join(&later[0].0);
+    image::open(&portrait).unwrap().rotate90().save(&portrait).unwrap();
     fs::copy(at("photos").join("00.png"), at("more").join("again.png")).unwrap();
     let data = at("data");
     let first = pose_silently(&PoseInput::new(at("photos"), &data)).unwrap();
@@ -32,6 +35,12 @@ fn photographs_are_added_to_a_dataset_whose_poses_stay() {
     input.into = true;
     let second = pose_silently(&input).unwrap();
     assert_eq!(second.registered, first.registered + later.len(), "{second:#?}");
+    let [level, turned] = &second.cameras[..] else {
+        panic!("{second:#?}");
+    };
+    let [width, height] = level.size;
+    assert_eq!((turned.photos, turned.size), (1, [height, width]));
+    assert_eq!((turned.focal_px, level.photos), (level.focal_px, first.registered + 4));
     let copy = second.left_out.iter().find(|left| left.name == "again.png").unwrap();
     assert!(copy.reason.contains("already, as 00.png"), "{copy:?}");
     let after = positions();

@@ -75,6 +75,18 @@ impl DCamera {
         self
     }
 
+    /// The camera of photographs that are turned clockwise by `turns` quarter turns.
+    pub fn turned(mut self, turns: u8) -> Self {
+        for _ in 0..turns {
+            let [fx, fy, cx, cy, k1, k2, k3, k4] = self.parameters;
+            // Tangential coefficients turn like a vector; those of a fisheye are all radial.
+            let last = if self.fisheye { [k3, k4] } else { [k4, -k3] };
+            self.parameters = [fy, fx, f64::from(self.height) - cy, cx, k1, k2, last[0], last[1]];
+            (self.width, self.height) = (self.height, self.width);
+        }
+        self
+    }
+
     /// Pixels per unit of the plane z = 1, averaged over both axes.
     pub fn focal(&self) -> f64 {
         0.5 * (self.parameters[0] + self.parameters[1])
@@ -293,6 +305,17 @@ mod tests {
             parameters: [300.0, 305.0, 322.0, 239.0, 0.03, -0.01, 0.002, -0.0005],
             fisheye: true,
             ..camera()
+        }
+    }
+
+    #[test]
+    fn a_turned_camera_sees_turned_photographs() {
+        let p = DVec3::new(0.7, -0.5, 2.0);
+        for camera in [camera(), fisheye()] {
+            let [at, turned] = [camera.pixel(p), camera.turned(1).pixel(DVec3::new(-p.y, p.x, p.z))];
+            assert!(turned.distance(DVec2::new(480.0 - at.y, at.x)) < 1e-9, "{turned}");
+            assert_eq!([camera.turned(1).width, camera.turned(1).height], [480, 640]);
+            assert_eq!(camera.turned(3).turned(1), camera);
         }
     }
 

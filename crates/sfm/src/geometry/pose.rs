@@ -32,6 +32,14 @@ impl DPose {
         self.rotation.inverse() * (point - self.position)
     }
 
+    /// The pose of the camera whose image is this one's, turned clockwise by `turns` quarter turns.
+    pub fn turned(&self, turns: u8) -> Self {
+        Self {
+            rotation: self.rotation * quarter_turns(turns).inverse(),
+            ..*self
+        }
+    }
+
     /// The rotation matrix from world to camera axes.
     pub fn camera_rotation(&self) -> DMat3 {
         DMat3::from_quat(self.rotation.inverse())
@@ -49,4 +57,9 @@ impl DPose {
     pub fn is_finite(&self) -> bool {
         self.rotation.is_finite() && self.position.is_finite()
     }
+}
+
+/// The rotation from camera axes to those of an image that is turned clockwise by `turns` quarter turns.
+pub fn quarter_turns(turns: u8) -> DQuat {
+    DQuat::from_rotation_z(f64::from(turns) * std::f64::consts::FRAC_PI_2)
 }

@@ -27,6 +27,7 @@ mod split;
 mod still;
 mod tracks;
 mod triangulation;
+mod turning;
 mod turntable;
 mod types;
 mod unfold;
@@ -47,6 +48,7 @@ pub use missing::{MIN_MISSING_PAIRS, missing_matches};
 pub use observable::determines_focal;
 pub(crate) use still::{MAX_INLIER_ERROR_LONG_SIDES, pairs_with_value, ransac_limits};
 pub use still::{StillRegion, duplicate_pairs, find_still_region, moving_matches};
+pub use turning::{Sensor, Turning};
 pub use turntable::turntable_rings;
 pub(crate) use types::rigs;
 pub use types::{

@@ -1,6 +1,7 @@
 use super::agreement::{agreement, contradictions, strengths};
 use super::focal::FocalSource;
 use super::missing::MIN_MISSING_PAIRS;
+use super::turning::Sensor;
 use crate::geometry::align::Alignment;
 use crate::geometry::camera::DCamera;
 use crate::geometry::essential::Motion;
@@ -24,6 +25,8 @@ pub struct PhotoInfo {
     pub height: u32,
     /// Photographs of the same group have the same camera; groups are numbered from 0.
     pub group: usize,
+    /// Which camera took it and how it was held, if the camera may have taken photographs of other groups as well.
+    pub sensor: Option<Sensor>,
     /// Focal length in px, if the photograph's metadata contain it.
     pub focal_prior_px: Option<f64>,
     /// The up direction in camera axes (x right, y down, z forward) if known; otherwise -y, as most photographs are taken, unless all look
@@ -43,6 +46,7 @@ impl PhotoInfo {
             width,
             height,
             group: 0,
+            sensor: None,
             focal_prior_px: None,
             up: None,
             camera: None,

@@ -6,7 +6,7 @@ use glam::{DQuat, DVec2, DVec3};
 use irradia_scene::Rng;
 use irradia_sfm::geometry::camera::DCamera;
 use irradia_sfm::geometry::pose::DPose;
-use irradia_sfm::map::{KnownGeometry, MapOptions, Model, PhotoInfo, Reconstruction, extend, reconstruct};
+use irradia_sfm::map::{KnownGeometry, MapOptions, Model, PhotoInfo, Reconstruction, Sensor, extend, reconstruct};
 use irradia_sfm::{Features, Keypoint, PairMatches};
 
 /// Photographs, features and matches with known cameras.
@@ -161,6 +161,28 @@ impl World {
             }
         }
         self.without_outside_matches()
+    }
+
+    /// The world with each photograph turned clockwise by `turns` quarter turns, as if its camera had been held so: those with 0, 1, 2, and
+    /// 3 are in groups of these numbers.
+    pub fn turned(mut self, turns: impl Fn(usize) -> u8) -> Self {
+        let photos = self.photos.iter_mut().zip(&mut self.features).zip(&mut self.poses);
+        for (i, ((photo, features), pose)) in photos.enumerate() {
+            let quarter_turns = turns(i);
+            photo.group = quarter_turns.into();
+            photo.sensor = Some(Sensor {
+                camera: 0,
+                quarter_turns,
+            });
+            *pose = pose.turned(quarter_turns);
+            for _ in 0..quarter_turns {
+                for k in &mut features.keypoints {
+                    (k.x, k.y) = (photo.height as f32 - k.y, k.x);
+                }
+                (photo.width, photo.height) = (photo.height, photo.width);
+            }
+        }
+        self
     }
 
     /// The world with each photograph cropped around its centre to `keep` times its size: each has its own camera.

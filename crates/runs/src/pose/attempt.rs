@@ -198,9 +198,10 @@ fn min_registered(photos: usize) -> usize {
 }
 
 /// Models of photographs without known poses. In a second attempt, if too few photographs have a pose, matches along epipolar lines are
-/// added. If the model contains half of the photographs, these weak matches might break it, so they only register photographs without a
-/// pose: mapping everything again took 195 s for 201 frames of a copier, 145 of them with a pose, and gave twelve models of 23 to 65
-/// frames, none of which was used. Narrow views are tried in the first attempt only.
+/// added. If the model contains half of the photographs, or 0.8 of few, these weak matches might break it, so they only register
+/// photographs without a pose: mapping everything again took 195 s for 201 frames of a copier, 145 of them with a pose, and gave twelve
+/// models of 23 to 65 frames, none of which was used; for 24 photographs of a can, 23 of them with a pose, it took 45 s, and none was
+/// gained. Narrow views are tried in the first attempt only.
 fn models(matched: &Matched, options: &MapOptions, on_progress: &mut dyn FnMut(Progress)) -> Reconstruction {
     let Matched { work, infos, pairs, .. } = matched;
     let is_second = work.sift().frontal;
@@ -216,8 +217,13 @@ fn models(matched: &Matched, options: &MapOptions, on_progress: &mut dyn FnMut(P
         guided: true,
         ..unguided
     };
+    let min_fraction = if infos.len() > FEW_PHOTOS {
+        0.5
+    } else {
+        MIN_POSED_FRACTION
+    };
     let is_mostly_mapped =
-        infos.len() > FEW_PHOTOS && 2 * found.registered() >= infos.len() && found.split_models.is_none();
+        found.registered() as f64 >= min_fraction * infos.len() as f64 && found.split_models.is_none();
     let again = if is_mostly_mapped {
         complete(infos, work.features(), pairs, &found, &guided, on_progress)
     } else {

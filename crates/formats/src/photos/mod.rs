@@ -73,17 +73,6 @@ impl PhotoEntry {
         [self.width, self.height]
     }
 
-    /// What the metadata say about the camera. Its focal length is rounded to 0.0001 long sides: the resolution of the sensor, from which it
-    /// may be computed, differs in the last digits between photographs held level and on the side.
-    fn camera_key(&self) -> (&Option<String>, &Option<String>, Option<i64>) {
-        let tags = &self.tags;
-        (
-            &tags.make,
-            &tags.model,
-            tags.focal.map(|focal| (1e4 * focal).round() as i64),
-        )
-    }
-
     /// The pixels, with 3 or 4 channels; a large JPEG is decoded at a half, quarter or eighth of its size if its longer side still has
     /// at least `min_side` pixels.
     ///
@@ -177,22 +166,23 @@ impl PhotoFolder {
     /// The index of each photograph's group: photographs of a group have the same make, model, focal length, size and quarter turns from
     /// the sensor.
     pub fn groups(&self) -> Vec<usize> {
-        numbered(
-            self.photos
-                .iter()
-                .map(|photo| (photo.camera_key(), photo.size(), photo.quarter_turns())),
-        )
+        let turns = self.photos.iter().map(PhotoEntry::quarter_turns);
+        numbered(self.cameras().into_iter().zip(turns))
     }
 
     /// The index of each photograph's camera: photographs of a camera have the same make, model, focal length and, however it was held,
     /// size.
+    ///
+    /// Focal lengths are rounded to 0.0001 long sides: the resolution of the sensor, from which they may be computed, differs in the last
+    /// digits between photographs held level and on the side.
     pub fn cameras(&self) -> Vec<usize> {
-        let sorted = |[a, b]: [u32; 2]| [a.min(b), a.max(b)];
-        numbered(
-            self.photos
-                .iter()
-                .map(|photo| (photo.camera_key(), sorted(photo.size()))),
-        )
+        let key = |photo: &PhotoEntry| {
+            let CameraTags { make, model, focal, .. } = photo.tags.clone();
+            let focal = focal.map(|focal| (1e4 * focal).round() as i64);
+            let [a, b] = photo.size();
+            (make, model, focal, [a.min(b), a.max(b)])
+        };
+        numbered(self.photos.iter().map(key))
     }
 }
 

@@ -20,7 +20,7 @@ pub struct Sensor {
 
 /// Photographs that were turned like most of those of their camera and joined their group, so that a few portraits among landscapes have no
 /// lens of their own: that of one among 12 photographs had a focal length that was wrong by 1.9 %.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Turning {
     turned: BTreeMap<usize, Turned>,
 }
@@ -138,7 +138,7 @@ impl Turning {
                 by_turn.entry(self.back(photo)).or_default().push(photo);
             }
             // The first keeps its number and must come last, since the others are copies of its camera.
-            for (order, (back, photos)) in by_turn.into_iter().enumerate().collect::<Vec<_>>().into_iter().rev() {
+            for (order, (back, photos)) in by_turn.into_iter().enumerate().rev() {
                 let group = if order == 0 { zoom.group } else { found.cameras.len() };
                 copy_camera(found, zoom.group, group, back);
                 split.insert((zoom.group, back), group);

@@ -1,4 +1,5 @@
 use crate::Malformed;
+use crate::text::text;
 
 /// Reads little-endian values from a byte slice; reading past its end is an error that names the position.
 pub(crate) struct ByteReader<'a> {
@@ -63,10 +64,10 @@ impl<'a> ByteReader<'a> {
         self.rest.is_empty()
     }
 
-    /// Bytes up to and including a zero; invalid UTF-8 is replaced.
+    /// Bytes up to and including a zero, as [`crate::text::text`] reads them: on Windows, names may be in its code page.
     pub fn text(&mut self) -> Result<String, Malformed> {
         let length = self.rest.iter().position(|byte| *byte == 0).unwrap_or(self.rest.len());
-        let text = String::from_utf8_lossy(self.take(length)?).into_owned();
+        let text = text(self.take(length)?).into_owned();
         self.u8()?;
         Ok(text)
     }

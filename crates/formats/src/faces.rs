@@ -6,7 +6,7 @@
 
 use crate::FormatError;
 use crate::Pixels;
-use crate::image_file::{Colour, decode};
+use crate::image_file::decode;
 use crate::undistort::Undistortion;
 use glam::{DQuat, DVec2, DVec3};
 use image::metadata::Orientation;
@@ -148,7 +148,7 @@ pub(crate) fn image_circle<'a>(
     let (width, height) = circle_image_size(source);
     let mut brightest = vec![0u8; (width * height) as usize];
     for (path, orientation) in photographs {
-        let pixels = decode(path, orientation, Colour::Keep)?;
+        let pixels = decode(path, orientation)?;
         for (max, pixel) in brightest.iter_mut().zip(max_channels(&pixels, width, height)) {
             *max = (*max).max(pixel);
         }

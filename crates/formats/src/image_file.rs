@@ -15,6 +15,9 @@ use std::path::Path;
 /// Maximum number of pixels, above the largest renders and the sensors of phones (200 megapixels); a damaged file may declare any size.
 pub(crate) const MAX_PIXELS: u64 = 1 << 28;
 
+/// Minimum value of a colour's largest channel for it not to be black in a mask: the palettes of PASCAL VOC and DAVIS begin with 64 and 128.
+const MIN_COLOR: u8 = 16;
+
 /// An image with 8 bits per channel.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Pixels {
@@ -57,15 +60,6 @@ pub(crate) struct Header {
     pub jpeg: bool,
 }
 
-/// Target channels of decoded pixels.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Colour {
-    /// Three channels, or four if the file has alpha.
-    Keep,
-    /// One channel.
-    Grey,
-}
-
 /// Reads a JPEG, PNG, WebP, TIFF, HEIC or `OpenEXR` of any depth as 3 or (if the file has alpha) 4 channels of 8 bits, with the EXIF
 /// orientation applied.
 ///
@@ -73,7 +67,7 @@ pub(crate) enum Colour {
 /// When the file cannot be read, is not an image, or is truncated.
 pub fn read_image(path: &Path) -> Result<Pixels, FormatError> {
     let header = read_header(path)?;
-    decode(path, header.orientation, Colour::Keep)
+    decode(path, header.orientation)
 }
 
 /// Writes an 8-bit PNG of 1, 3 or 4 channels, atomically.
@@ -227,32 +221,78 @@ pub(crate) fn read_metadata(path: &Path) -> Metadata {
     read().unwrap_or_default()
 }
 
-/// The pixels, with `orientation` applied.
-pub(crate) fn decode(path: &Path, orientation: Orientation, colour: Colour) -> Result<Pixels, FormatError> {
+/// The pixels, with `orientation` applied: three channels, or four if the file has alpha.
+pub(crate) fn decode(path: &Path, orientation: Orientation) -> Result<Pixels, FormatError> {
     let (decoder, _) = open(path)?;
     let image = DynamicImage::from_decoder(decoder).map_err(|error| undecodable(path, &error))?;
-    Ok(oriented_pixels(image, orientation, colour))
+    Ok(oriented_pixels(image, orientation))
 }
 
-/// The pixels of a mask, 0 to 255; a mask of zeros and ones is scaled to that range.
+/// The pixels of a mask, 0 to 255. Where masks are not black and white, black is ignored and all else is kept: labels (0, 1, 2, ..),
+/// colours and palettes, at any depth. The alpha of an image of a single colour is the mask.
 pub(crate) fn decode_mask(path: &Path, orientation: Orientation) -> Result<Pixels, FormatError> {
-    let mut mask = decode(path, orientation, Colour::Grey)?;
-    if mask.data.iter().max() == Some(&1) {
-        mask.data.iter_mut().for_each(|value| *value *= 255);
+    let (decoder, jpeg) = open(path)?;
+    let mut image = DynamicImage::from_decoder(decoder).map_err(|error| undecodable(path, &error))?;
+    image.apply_orientation(orientation);
+    let (width, height) = (image.width(), image.height());
+    let data = alpha_of_single_color(&image).unwrap_or_else(|| {
+        // A JPEG's black is not exact, so its labels cannot be told from noise.
+        if jpeg {
+            image.to_luma8().into_raw()
+        } else {
+            mask_values(&image)
+        }
+    });
+    Ok(Pixels {
+        width,
+        height,
+        channels: 1,
+        data,
+    })
+}
+
+/// The alpha of an image whose colour is the same everywhere, if it varies.
+fn alpha_of_single_color(image: &DynamicImage) -> Option<Vec<u8>> {
+    if !image.color().has_alpha() {
+        return None;
     }
-    Ok(mask)
+    let pixels = image.to_rgba8();
+    let first = pixels.pixels().next()?.0;
+    let is_single = pixels.pixels().all(|pixel| pixel.0[..3] == first[..3]);
+    let varies = pixels.pixels().any(|pixel| pixel.0[3] != first[3]);
+    (is_single && varies).then(|| pixels.pixels().map(|pixel| pixel.0[3]).collect())
+}
+
+/// The values of a mask without losses: 255 for all that is not black if it holds labels or colours, otherwise its brightness.
+fn mask_values(image: &DynamicImage) -> Vec<u8> {
+    let pixels = image.to_rgb8();
+    if pixels.pixels().any(|pixel| grey(pixel.0).is_none()) {
+        let is_black = |channels: [u8; 3]| channels.iter().all(|channel| *channel < MIN_COLOR);
+        return pixels
+            .pixels()
+            .map(|pixel| if is_black(pixel.0) { 0 } else { 255 })
+            .collect();
+    }
+    let levels = image.to_luma16();
+    let has_labels = levels.iter().all(|level| *level < 1 << 15);
+    let value = |level: &u16| match (has_labels, level) {
+        (true, 0) => 0,
+        (true, _) => 255,
+        (false, level) => (level >> 8) as u8,
+    };
+    levels.iter().map(value).collect()
 }
 
 /// The pixels of a HEIC image in memory.
 pub(crate) fn decode_heic(bytes: &[u8]) -> Result<Pixels, image::ImageError> {
     let image = DynamicImage::from_decoder(HeicDecoder::new(bytes.to_vec())?)?;
-    Ok(oriented_pixels(image, Orientation::NoTransforms, Colour::Keep))
+    Ok(oriented_pixels(image, Orientation::NoTransforms))
 }
 
 /// The pixels of an `OpenEXR` image in memory.
 pub(crate) fn decode_exr(bytes: &[u8]) -> Result<Pixels, image::ImageError> {
     let image = DynamicImage::from_decoder(ExrDecoder::new(Cursor::new(bytes))?)?;
-    Ok(oriented_pixels(image, Orientation::NoTransforms, Colour::Keep))
+    Ok(oriented_pixels(image, Orientation::NoTransforms))
 }
 
 /// The values of a grey image as stored (8 bits, 16 bits or `OpenEXR`): width, height and `[H, W]`.
@@ -321,13 +361,13 @@ fn grey<T: PartialEq + Copy>([red, green, blue]: [T; 3]) -> Option<T> {
 }
 
 /// `image` with `orientation` applied.
-fn oriented_pixels(mut image: DynamicImage, orientation: Orientation, colour: Colour) -> Pixels {
+fn oriented_pixels(mut image: DynamicImage, orientation: Orientation) -> Pixels {
     image.apply_orientation(orientation);
     let (width, height) = (image.width(), image.height());
-    let (channels, data) = match colour {
-        Colour::Grey => (1, image.into_luma8().into_raw()),
-        Colour::Keep if image.color().has_alpha() => (4, image.into_rgba8().into_raw()),
-        Colour::Keep => (3, image.into_rgb8().into_raw()),
+    let (channels, data) = if image.color().has_alpha() {
+        (4, image.into_rgba8().into_raw())
+    } else {
+        (3, image.into_rgb8().into_raw())
     };
     Pixels {
         width,
@@ -372,9 +412,9 @@ pub(crate) fn decode_jpeg_scaled(path: &Path, divisor: u32, orientation: Orienta
         _ => None,
     };
     if let Some(image) = image {
-        return Ok(oriented_pixels(image, orientation, Colour::Keep));
+        return Ok(oriented_pixels(image, orientation));
     }
-    let full = decode(path, orientation, Colour::Keep)?;
+    let full = decode(path, orientation)?;
     let to = [full.width.div_ceil(divisor), full.height.div_ceil(divisor)];
     Ok(Pixels {
         width: to[0],
@@ -565,7 +605,7 @@ mod tests {
         let upright = Orientation::NoTransforms;
         for result in [
             read_header(&path).map(|_| ()),
-            decode(&path, upright, Colour::Keep).map(|_| ()),
+            decode(&path, upright).map(|_| ()),
             decode_jpeg_scaled(&path, 8, upright).map(|_| ()),
         ] {
             let error = result.unwrap_err().to_string();

@@ -14,6 +14,7 @@ mod error;
 mod faces;
 mod heic;
 mod image_file;
+mod json;
 mod map_file;
 mod open_exr;
 mod pack;

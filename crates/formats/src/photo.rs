@@ -1,5 +1,5 @@
 use crate::DEFAULT_MAX_SIDE;
-use crate::image_file::{Colour, decode, decode_jpeg_scaled, decode_mask, read_header};
+use crate::image_file::{decode, decode_jpeg_scaled, decode_mask, read_header};
 use crate::undistort::Undistortion;
 use crate::valid_region::ValidRegion;
 use crate::{FormatError, Pixels};
@@ -83,7 +83,7 @@ impl PhotoFile {
     fn read(&self, size: (u32, u32)) -> Result<Photo, FormatError> {
         let divisor = self.divisor(size);
         let pixels = if divisor == 1 {
-            decode(&self.image, self.orientation, Colour::Keep)?
+            decode(&self.image, self.orientation)?
         } else {
             decode_jpeg_scaled(&self.image, divisor, self.orientation)?
         };

@@ -235,7 +235,15 @@ fn exif_orientation_is_applied_exactly_when_the_poses_include_it() {
         (60, false),
         "the same, of a smaller copy"
     );
-    assert_eq!(corner(r#""fl_x": 70"#), (60, false), "undeclared: upright");
+    assert_eq!(corner(r#""fl_x": 70"#), (80, true), "undeclared: as stored");
+    // A half turn fits either way.
+    for i in 0..3 {
+        let file = root.join(format!("images/{i:02}.png"));
+        let mut bytes = fs::read(&file).unwrap();
+        bytes[30] = 3;
+        fs::write(file, bytes).unwrap();
+    }
+    assert_eq!(corner(r#""fl_x": 70, "w": 80, "h": 60"#), (80, true), "as stored");
 }
 
 #[test]

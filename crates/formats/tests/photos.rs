@@ -176,6 +176,43 @@ fn other_kinds_of_pictures_and_masks_are_read() {
 }
 
 #[test]
+fn labels_colours_depths_and_alpha_are_masks() {
+    use image::{GrayImage, ImageBuffer, Luma, Rgb, RgbImage, Rgba, RgbaImage};
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    fs::create_dir(root.join("masks")).unwrap();
+    picture(40, 30, 90).save(root.join("a.png")).unwrap();
+    let path = root.join("masks/a.png");
+    let kept = || {
+        let found = read_photo_folder(root).unwrap();
+        let mask = found.photos[0].read_mask(40, 30).unwrap().unwrap();
+        mask.iter().filter(|value| **value >= 128).count()
+    };
+    let grey = |values: [u8; 3]| GrayImage::from_fn(40, 30, |x, _| Luma([values[x as usize * 3 / 42]]));
+    grey([0, 1, 2]).save(&path).unwrap();
+    assert_eq!(kept(), 26 * 30, "labels");
+    grey([0, 100, 255]).save(&path).unwrap();
+    assert_eq!(kept(), 12 * 30, "a soft edge");
+    grey([0; 3]).save(&path).unwrap();
+    assert_eq!(kept(), 0, "black");
+    let deep = |value: u16| ImageBuffer::from_fn(40, 30, |x, _| Luma([if x < 20 { 0 } else { value }]));
+    for value in [1, 255, u16::MAX] {
+        deep(value).save(&path).unwrap();
+        assert_eq!(kept(), 20 * 30, "16 bits, {value}");
+    }
+    let colors = [[0, 0, 0], [128, 0, 0], [0, 0, 64], [255, 255, 255]];
+    RgbImage::from_fn(40, 30, |x, _| Rgb(colors[x as usize / 10]))
+        .save(&path)
+        .unwrap();
+    assert_eq!(kept(), 30 * 30, "colours");
+    let alpha = |x: u32| if x < 10 { 255 } else { 0 };
+    RgbaImage::from_fn(40, 30, |x, _| Rgba([255, 255, 255, alpha(x)]))
+        .save(&path)
+        .unwrap();
+    assert_eq!(kept(), 10 * 30, "alpha");
+}
+
+#[test]
 fn masks_of_turned_photographs_are_turned_with_them() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();

@@ -91,7 +91,6 @@ pub(super) fn assemble(declared: DeclaredDataset, options: &DatasetOptions) -> R
         root,
         mut views,
         points,
-        ignores_exif,
         downscale,
         mut warnings,
     } = declared;
@@ -119,8 +118,7 @@ pub(super) fn assemble(declared: DeclaredDataset, options: &DatasetOptions) -> R
         }
     }
 
-    let mut probed: Vec<Result<ProbedView, SkipReason>> =
-        views.par_iter().map(|view| probe(view, ignores_exif)).collect();
+    let mut probed: Vec<Result<ProbedView, SkipReason>> = views.par_iter().map(probe).collect();
     plan_pinhole_images(&views, &mut probed, options.lenses);
     let reasons = skipped_warnings(&views, &probed);
     let usable: Vec<(DeclaredView, ProbedView)> = views
@@ -211,13 +209,13 @@ fn without_duplicates(views: Vec<DeclaredView>) -> Vec<DeclaredView> {
         .collect()
 }
 
-fn probe(view: &DeclaredView, ignores_exif: bool) -> Result<ProbedView, SkipReason> {
+fn probe(view: &DeclaredView) -> Result<ProbedView, SkipReason> {
     let image = view.image.as_deref().ok_or(SkipReason::MissingImage)?;
     if view.pose.is_none() {
         return Err(SkipReason::NoPose);
     }
     let header = read_header(image).map_err(|_| SkipReason::UnreadableImage)?;
-    let orientation = orientation_to_apply(&header, view.camera.size, ignores_exif);
+    let orientation = orientation_to_apply(&header, view.camera.size);
     let (width, height) = oriented_size(&header, orientation);
     let source = view.camera.at_size(width, height);
     if !source.is_valid() || !source.lens.is_finite() {
@@ -431,14 +429,14 @@ impl ViewBuilder<'_> {
 }
 
 /// See [`super::read_dataset`] for the rule.
-fn orientation_to_apply(header: &Header, declared: Option<[f64; 2]>, ignores_exif: bool) -> Orientation {
+fn orientation_to_apply(header: &Header, declared: Option<[f64; 2]>) -> Orientation {
     let upright = oriented_size(header, header.orientation);
     let stored = (header.width, header.height);
     // Aspects, not sizes: the images may be smaller copies of those from which the poses were made.
     let mismatch = |(w, h): (u32, u32), [dw, dh]: [f64; 2]| (f64::from(w) / f64::from(h)).ln() - (dw / dh).ln();
     let apply_exif = match declared {
         Some(size) if upright != stored => mismatch(upright, size).abs() <= mismatch(stored, size).abs(),
-        _ => !ignores_exif,
+        _ => false,
     };
     if apply_exif {
         header.orientation
@@ -460,7 +458,7 @@ pub(crate) fn oriented_size(header: &Header, orientation: Orientation) -> (u32, 
 pub(crate) fn colmap_orientation(header: &Header) -> (Orientation, Option<[i8; 2]>) {
     use Orientation::{FlipVertical, Rotate90, Rotate90FlipH, Rotate180, Rotate270, Rotate270FlipH};
     let (width, height) = oriented_size(header, header.orientation);
-    let applied = orientation_to_apply(header, Some([f64::from(width), f64::from(height)]), true);
+    let applied = orientation_to_apply(header, Some([f64::from(width), f64::from(height)]));
     let up = match header.orientation {
         orientation if orientation == applied => None,
         Rotate180 | FlipVertical => Some([0, 1]),

@@ -41,7 +41,6 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
         root: root.to_owned(),
         views,
         points,
-        ignores_exif: false,
         downscale,
         warnings,
     })

@@ -104,7 +104,6 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
         root,
         views,
         points: Some(points),
-        ignores_exif: true,
         downscale,
         warnings: Vec::new(),
     })

@@ -13,8 +13,6 @@ pub(super) struct DeclaredDataset {
     pub root: PathBuf,
     pub views: Vec<DeclaredView>,
     pub points: Option<DeclaredPoints>,
-    /// Whether the tool that made it ignores EXIF orientation.
-    pub ignores_exif: bool,
     /// Factor by which the images must still be downscaled.
     pub downscale: f32,
     pub warnings: Vec<String>,

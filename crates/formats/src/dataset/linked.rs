@@ -53,7 +53,6 @@ impl<K: Eq + Hash> Linked<K> {
             root: root.to_owned(),
             views,
             points: Some(self.points),
-            ignores_exif: true,
             downscale,
             warnings: warning.into_iter().collect(),
         }

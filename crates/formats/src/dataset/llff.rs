@@ -115,7 +115,6 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
         root: root.to_owned(),
         views,
         points: None,
-        ignores_exif: false,
         downscale: folder.downscale,
         warnings,
     })

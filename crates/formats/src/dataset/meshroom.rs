@@ -7,6 +7,7 @@ use super::files::{first_file, locate_image};
 use super::linked::{Linked, LinkedView};
 use super::tracks::declared_points;
 use crate::error::read_and_parse;
+use crate::json::parse_json;
 use crate::{FormatError, Malformed};
 use glam::DVec3;
 use irradia_scene::Lens;
@@ -173,7 +174,7 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
 /// # Errors
 /// When it is not JSON of that structure; with line and column.
 pub fn parse_meshroom(bytes: &[u8]) -> Result<SfmFile, Malformed> {
-    serde_json::from_slice(bytes).map_err(|error| Malformed(format!("not a usable .sfm file: {error}")))
+    parse_json(bytes, ".sfm file")
 }
 
 impl SfmFile {

@@ -5,11 +5,13 @@ use super::declared::{
     DeclaredCamera, DeclaredDataset, DeclaredPose, DeclaredView, Focal, lens_or_pinhole, pose_from_axes,
 };
 use super::files::{first_file, locate_image, start_matches};
+use super::images::PhotographsBelow;
 use crate::error::read_and_parse;
 use crate::xml::{Element, parse_xml};
 use crate::{FormatError, Malformed};
 use glam::{DMat3, DVec3};
 use irradia_scene::Lens;
+use std::cell::LazyCell;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
@@ -28,30 +30,43 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
     let cameras = read_and_parse(&file, parse_metashape)?;
     let root = file.parent().unwrap_or(Path::new(".")).to_owned();
     let (enabled, disabled): (Vec<_>, Vec<_>) = cameras.into_iter().partition(|camera| camera.is_enabled);
-    let (posed, unposed): (Vec<_>, Vec<_>) = enabled.into_iter().partition(|camera| camera.pose.is_some());
+    let count = enabled.len();
+    let posed: Vec<(String, Aligned)> = enabled
+        .into_iter()
+        .filter_map(|camera| Some((camera.label, camera.aligned?)))
+        .collect();
     let mut warnings = Vec::new();
     if !disabled.is_empty() {
         warnings.push(format!("{} photographs are disabled and are skipped", disabled.len()));
     }
-    if !unposed.is_empty() {
-        warnings.push(format!("{} photographs are not aligned and are skipped", unposed.len()));
+    if posed.len() < count {
+        let unposed = count - posed.len();
+        warnings.push(format!("{unposed} photographs are not aligned and are skipped"));
     }
-    let skewed = posed.iter().filter(|camera| camera.is_skewed).count();
-    if skewed > 0 {
-        warnings.push(format!(
-            "the skew (b2) of {skewed} photographs is ignored; optimise the cameras without it, or undistort the photographs"
-        ));
+    type Has = fn(&Sensor) -> bool;
+    let ignored: [(&str, Has); 2] = [
+        ("skew (b2)", |sensor| sensor.is_skewed),
+        ("p3 and p4", |sensor| sensor.has_p3_or_p4),
+    ];
+    for (name, has) in ignored {
+        let count = posed.iter().filter(|(_, aligned)| has(&aligned.sensor)).count();
+        if count > 0 {
+            warnings.push(format!(
+                "the {name} of {count} photographs is ignored; optimise the cameras without it, or undistort the photographs"
+            ));
+        }
     }
-    let view = |camera: MetashapeCamera| {
-        let name = camera.label.replace('\\', "/");
-        let image = locate_image(&root, &IMAGE_FOLDERS, &name);
-        DeclaredView::posed(&root, &name, image, camera.pose, camera.intrinsics)
+    // Labels have no folders.
+    let below = LazyCell::new(|| PhotographsBelow::find(&root));
+    let view = |(label, aligned): (String, Aligned)| {
+        let name = label.replace('\\', "/");
+        let image = locate_image(&root, &IMAGE_FOLDERS, &name).or_else(|| below.only(&name));
+        DeclaredView::posed(&root, &name, image, Some(aligned.pose), aligned.sensor.camera)
     };
     Ok(DeclaredDataset {
         kind: "Metashape",
         views: posed.into_iter().map(view).collect(),
         points: None,
-        ignores_exif: true,
         downscale,
         warnings,
         root,
@@ -63,11 +78,23 @@ pub(crate) struct MetashapeCamera {
     label: String,
     /// Whether its user has left it enabled.
     is_enabled: bool,
-    /// `None` if it is not aligned.
-    pose: Option<DeclaredPose>,
-    intrinsics: DeclaredCamera,
-    /// Whether its columns are not perpendicular to its rows, which `intrinsics` cannot say.
+    /// `None` if it is disabled or not aligned.
+    aligned: Option<Aligned>,
+}
+
+struct Aligned {
+    pose: DeclaredPose,
+    sensor: Sensor,
+}
+
+/// The intrinsics of photographs, and what they have that these cannot say.
+#[derive(Clone, Copy)]
+struct Sensor {
+    camera: DeclaredCamera,
+    /// Whether the columns of pixels are not perpendicular to the rows.
     is_skewed: bool,
+    /// Whether the tangential distortion grows with the distance from the middle, as in old versions.
+    has_p3_or_p4: bool,
 }
 
 /// Rotation, translation and scale from a chunk to the world.
@@ -86,9 +113,15 @@ pub(crate) fn parse_metashape(bytes: &[u8]) -> Result<Vec<MetashapeCamera>, Malf
     for sensor in chunk.descendants("sensor") {
         // A panorama needs no calibration, and a sensor that took no aligned photograph has none.
         if let (Some(id), Some("spherical")) = (sensor.attribute("id"), sensor.attribute("type")) {
-            sensors.insert(id, (DeclaredCamera::panorama(), false));
+            let sensor = Sensor {
+                camera: DeclaredCamera::panorama(),
+                is_skewed: false,
+                has_p3_or_p4: false,
+            };
+            sensors.insert(id, Ok(sensor));
         } else if let (Some(id), Some(calibration)) = (sensor.attribute("id"), calibration(sensor)) {
-            sensors.insert(id, intrinsics(sensor, calibration)?);
+            // An unsupported one is an error only if it took an aligned photograph.
+            sensors.insert(id, parse_sensor(sensor, calibration));
         }
     }
     let world_from_chunk = chunk.child("transform").and_then(transform);
@@ -106,31 +139,25 @@ pub(crate) fn parse_metashape(bytes: &[u8]) -> Result<Vec<MetashapeCamera>, Malf
         let is_enabled = !matches!(camera.attribute("enabled"), Some("false" | "0"));
         let matrix = camera.child("transform").map(Element::numbers);
         let sensor = camera.attribute("sensor_id").and_then(|id| sensors.get(id));
-        let (Some(matrix), Some((intrinsics, is_skewed))) = (matrix, sensor) else {
-            if let Some((intrinsics, is_skewed)) = sensors.values().next() {
-                found.push(MetashapeCamera {
-                    label: label.to_owned(),
-                    is_enabled,
-                    pose: None,
-                    intrinsics: *intrinsics,
-                    is_skewed: *is_skewed,
-                });
+        let aligned = match (matrix, sensor) {
+            (Some(matrix), Some(sensor)) if is_enabled => {
+                if matrix.len() != 16 {
+                    return Err(Malformed(format!(
+                        "the transform of camera {label} has {} numbers, not 16",
+                        matrix.len()
+                    )));
+                }
+                let component = camera.attribute("component_id").and_then(|id| components.get(id));
+                let pose = pose(&matrix, component.or(world_from_chunk.as_ref()));
+                let sensor = sensor.clone()?;
+                pose.map(|pose| Aligned { pose, sensor })
             }
-            continue;
+            _ => None,
         };
-        if matrix.len() != 16 {
-            return Err(Malformed(format!(
-                "the transform of camera {label} has {} numbers, not 16",
-                matrix.len()
-            )));
-        }
-        let component = camera.attribute("component_id").and_then(|id| components.get(id));
         found.push(MetashapeCamera {
             label: label.to_owned(),
             is_enabled,
-            pose: pose(&matrix, component.or(world_from_chunk.as_ref())),
-            intrinsics: *intrinsics,
-            is_skewed: *is_skewed,
+            aligned,
         });
     }
     Ok(found)
@@ -166,8 +193,7 @@ fn transform(element: &Element) -> Option<Transform> {
     })
 }
 
-/// The intrinsics, and whether the columns of pixels are not perpendicular to the rows, which the intrinsics cannot say.
-fn intrinsics(sensor: &Element, calibration: &Element) -> Result<(DeclaredCamera, bool), Malformed> {
+fn parse_sensor(sensor: &Element, calibration: &Element) -> Result<Sensor, Malformed> {
     let resolution = calibration.child("resolution").or_else(|| sensor.child("resolution"));
     let side = |name: &str| -> Option<f64> { resolution?.attribute(name)?.parse().ok() };
     let size = side("width")
@@ -222,7 +248,13 @@ fn intrinsics(sensor: &Element, calibration: &Element) -> Result<(DeclaredCamera
         center: Some(center),
         lens: lens_or_pinhole(lens),
     };
-    Ok((camera, coefficient("b2") != 0.0))
+    let is_any = |names: [&str; 2]| names.into_iter().any(|name| coefficient(name) != 0.0);
+    Ok(Sensor {
+        camera,
+        // Old versions write the skew under its name.
+        is_skewed: is_any(["b2", "skew"]),
+        has_p3_or_p4: is_any(["p3", "p4"]),
+    })
 }
 
 #[cfg(test)]
@@ -241,7 +273,27 @@ mod tests {
             p: [0.02, 0.01],
             s: [0.0; 2],
         };
-        assert_eq!(cameras[0].intrinsics.lens, lens);
-        assert!(cameras[0].is_skewed);
+        let sensor = cameras[0].aligned.as_ref().unwrap().sensor;
+        assert_eq!(sensor.camera.lens, lens);
+        assert!(sensor.is_skewed && !sensor.has_p3_or_p4);
+    }
+
+    #[test]
+    fn an_unsupported_sensor_is_an_error_only_if_it_is_used() {
+        let text = |camera: &str| {
+            format!(
+                r#"<document><chunk><sensors><sensor id="0"><resolution width="64" height="48"/><calibration><f>20</f><p3>2</p3>
+                </calibration></sensor><sensor id="1"><resolution width="64" height="48"/><calibration><f>20</f><k4>2</k4></calibration>
+                </sensor></sensors><cameras><camera id="0" sensor_id="0" label="a">
+                <transform>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform></camera>{camera}</cameras></chunk></document>"#
+            )
+        };
+        let cameras = parse_metashape(text(r#"<camera id="1" sensor_id="1" label="b"/>"#).as_bytes()).unwrap();
+        assert!(cameras[0].aligned.as_ref().unwrap().sensor.has_p3_or_p4);
+        assert!(cameras[1].aligned.is_none());
+        let used =
+            r#"<camera id="1" sensor_id="1" label="b"><transform>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform></camera>"#;
+        assert!(parse_metashape(text(used).as_bytes()).err().unwrap().0.contains("k4"));
+        assert!(parse_metashape(text(&used.replace("label", r#"enabled="0" label"#)).as_bytes()).is_ok());
     }
 }

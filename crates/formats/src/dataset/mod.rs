@@ -272,7 +272,7 @@ impl Default for DatasetOptions {
 ///
 /// EXIF orientation: poses belong to the pixels as the tool that made them saw them. If the declared size has the aspect of the
 /// stored image only, no orientation is applied; if it has the aspect of the upright image, it is applied; if both match (half
-/// turns, square images) it is applied, except for COLMAP, which ignores EXIF orientation.
+/// turns, square images) or none is declared, it is not, since COLMAP, nerfstudio and instant-ngp ignore it.
 ///
 /// # Errors
 /// When the folder is not a dataset (the error says what was expected), a file is unreadable or malformed, cameras have no

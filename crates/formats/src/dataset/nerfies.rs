@@ -6,6 +6,7 @@ use super::declared::{
 };
 use super::files::find_image;
 use crate::error::read_and_parse;
+use crate::json::parse_json;
 use crate::{FormatError, Malformed};
 use glam::DVec3;
 use irradia_scene::Lens;
@@ -74,7 +75,7 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
     let dataset = read_and_parse(&path.join("dataset.json"), parse_nerfies_dataset)?;
     let file = path.join("metadata.json");
     let metadata: HashMap<String, NerfiesMetadata> = if file.is_file() {
-        read_and_parse(&file, |bytes| parse_json(bytes, "metadata"))?
+        read_and_parse(&file, |bytes| parse_json(bytes, "metadata file of Nerfies"))?
     } else {
         HashMap::new()
     };
@@ -129,15 +130,9 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
         root: path.to_owned(),
         views,
         points: None,
-        ignores_exif: true,
         downscale: if exact.is_some() { 1.0 } else { downscale },
         warnings,
     })
-}
-
-fn parse_json<T: for<'a> Deserialize<'a>>(bytes: &[u8], file_kind: &str) -> Result<T, Malformed> {
-    serde_json::from_slice(bytes)
-        .map_err(|error| Malformed(format!("not a usable {file_kind} file of Nerfies: {error}")))
 }
 
 /// Parses `dataset.json`.
@@ -145,7 +140,7 @@ fn parse_json<T: for<'a> Deserialize<'a>>(bytes: &[u8], file_kind: &str) -> Resu
 /// # Errors
 /// When it is not JSON with `ids`.
 pub fn parse_nerfies_dataset(bytes: &[u8]) -> Result<NerfiesDataset, Malformed> {
-    parse_json(bytes, "dataset")
+    parse_json(bytes, "dataset file of Nerfies")
 }
 
 /// Parses a file of `camera`.
@@ -153,7 +148,7 @@ pub fn parse_nerfies_dataset(bytes: &[u8]) -> Result<NerfiesDataset, Malformed> 
 /// # Errors
 /// When it is not JSON with these keys.
 pub fn parse_nerfies_camera(bytes: &[u8]) -> Result<NerfiesCamera, Malformed> {
-    parse_json(bytes, "camera")
+    parse_json(bytes, "camera file of Nerfies")
 }
 
 impl NerfiesCamera {

@@ -53,7 +53,6 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
         root,
         views,
         points,
-        ignores_exif: false,
         downscale,
         warnings,
     })

@@ -77,7 +77,6 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
         views: views.collect(),
         root,
         points: Some(points),
-        ignores_exif: true,
         downscale,
         warnings,
     })

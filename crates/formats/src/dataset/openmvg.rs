@@ -6,6 +6,7 @@ use super::files::{file_named, find_image, locate_image};
 use super::linked::{Linked, LinkedView};
 use super::tracks::declared_points;
 use crate::error::read_and_parse;
+use crate::json::parse_json;
 use crate::{FormatError, Malformed};
 use irradia_scene::Lens;
 use serde::Deserialize;
@@ -130,7 +131,7 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
 /// # Errors
 /// When it is not JSON of that structure; with line and column.
 pub fn parse_openmvg(bytes: &[u8]) -> Result<SfmData, Malformed> {
-    serde_json::from_slice(bytes).map_err(|error| Malformed(format!("not a usable sfm_data file: {error}")))
+    parse_json(bytes, "sfm_data file")
 }
 
 impl SfmData {

@@ -6,6 +6,7 @@ use super::declared::{
 };
 use super::files::{file_named, locate_image};
 use crate::error::read_and_parse;
+use crate::json::parse_json;
 use crate::{FormatError, Malformed};
 use glam::{DQuat, DVec3};
 use irradia_scene::Lens;
@@ -38,6 +39,8 @@ pub struct Reconstruction {
 #[derive(Clone, Debug, Deserialize)]
 #[allow(missing_docs)] // The format's own names.
 pub struct Camera {
+    /// Absent in files of old versions.
+    #[serde(default = "perspective")]
     pub projection_type: String,
     pub width: f64,
     pub height: f64,
@@ -60,6 +63,10 @@ pub struct Camera {
     pub p1: f64,
     #[serde(default)]
     pub p2: f64,
+}
+
+fn perspective() -> String {
+    "perspective".to_owned()
 }
 
 /// A posed photograph.
@@ -130,7 +137,6 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
         root,
         views,
         points: Some(points),
-        ignores_exif: true,
         downscale,
         warnings,
     })
@@ -141,7 +147,7 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
 /// # Errors
 /// When it is not JSON of that structure; with line and column.
 pub fn parse_opensfm(bytes: &[u8]) -> Result<Vec<Reconstruction>, Malformed> {
-    serde_json::from_slice(bytes).map_err(|error| Malformed(format!("not a usable reconstruction: {error}")))
+    parse_json(bytes, "reconstruction")
 }
 
 fn pose(shot: &Shot) -> Option<DeclaredPose> {

@@ -4,6 +4,7 @@
 use super::declared::{DeclaredCamera, DeclaredDataset, DeclaredPose, DeclaredView, Focal, pose_from_axes};
 use super::files::{find_image, list_files};
 use crate::error::read_and_parse;
+use crate::json::parse_json;
 use crate::{FormatError, Malformed};
 use glam::{DMat3, DQuat, DVec3};
 use irradia_scene::Lens;
@@ -114,7 +115,7 @@ pub(super) fn read_record3d(path: &Path, downscale: f32) -> Result<DeclaredDatas
 /// # Errors
 /// When it is not JSON with these keys.
 pub fn parse_polycam(bytes: &[u8]) -> Result<PolycamCamera, Malformed> {
-    serde_json::from_slice(bytes).map_err(|error| Malformed(format!("not a usable Polycam camera: {error}")))
+    parse_json(bytes, "Polycam camera")
 }
 
 /// Parses the `metadata.json` of Record3D.
@@ -122,7 +123,7 @@ pub fn parse_polycam(bytes: &[u8]) -> Result<PolycamCamera, Malformed> {
 /// # Errors
 /// When it is not JSON with these keys.
 pub fn parse_record3d(bytes: &[u8]) -> Result<Record3d, Malformed> {
-    serde_json::from_slice(bytes).map_err(|error| Malformed(format!("not a usable Record3D capture: {error}")))
+    parse_json(bytes, "Record3D capture")
 }
 
 impl PolycamCamera {
@@ -160,7 +161,6 @@ fn declared_dataset(kind: &'static str, root: &Path, views: Vec<DeclaredView>, d
         root: root.to_owned(),
         views,
         points: None,
-        ignores_exif: true,
         downscale,
         warnings: Vec::new(),
     }

@@ -1,6 +1,7 @@
 //! Cameras exported by RealityCapture: a `.csv` of internal and external parameters, or an `.xmp` beside each photograph.
 //!
-//! Focal lengths are in mm for film 36 mm wide, which corresponds to the longer side of the image. Angles of the CSV, in degrees, rotate
+//! Focal lengths are in mm for film 36 mm wide, which corresponds to the longer side of the image; offsets of the principal point are
+//! fractions of that side, in both files (Epic's "Camera math" of RealityScan). Angles of the CSV, in degrees, rotate
 //! a camera that looks along -Z with Y up: roll about Y, pitch about X, then the negative heading about Z (nerfstudio's
 //! `realitycapture_utils.py`). An XMP has camera-from-world with OpenCV axes. The tangential coefficients t1 and t2 are OpenCV's p2 and
 //! p1, as in the program's own export template for OpenCV and in AliceVision's importer.
@@ -108,7 +109,6 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
         root,
         views,
         points: None,
-        ignores_exif: true,
         downscale,
         warnings: Vec::new(),
     })
@@ -176,7 +176,7 @@ pub fn parse_realitycapture_csv(bytes: &[u8]) -> Result<Vec<RealityCaptureView>,
             axes: [rotation.x_axis, -rotation.y_axis, -rotation.z_axis],
             position: DVec3::new(number("x")?, number("y")?, number("alt")?),
             focal: number("f")? / FILM_WIDTH_MM,
-            offset: [optional("px")? / FILM_WIDTH_MM, optional("py")? / FILM_WIDTH_MM],
+            offset: [optional("px")?, optional("py")?],
             k: [optional("k1")?, optional("k2")?, optional("k3")?],
             p: [optional("t2")?, optional("t1")?],
         });

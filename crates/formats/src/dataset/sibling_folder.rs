@@ -6,7 +6,7 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 /// Maximum depth of the search, which a link back to a parent would otherwise make endless.
-const MAX_DEPTH: u32 = 6;
+pub(super) const MAX_DEPTH: u32 = 6;
 
 /// The files in a separate folder, by the image that they belong to.
 pub struct SiblingFolder {
@@ -104,7 +104,8 @@ pub(super) fn find_maps(declared: &mut DeclaredDataset) {
     }
 }
 
-fn collect(
+/// The files that `keep` accepts in `folder` and its subfolders, by path below `top`, lower case, without extension.
+pub(super) fn collect(
     top: &Path,
     folder: &Path,
     depth: u32,

@@ -3,6 +3,7 @@
 use super::declared::{DeclaredCamera, DeclaredPose, Focal, lens_or_pinhole, pose_from_axes};
 use super::readout::shutter_from_velocities;
 use crate::Malformed;
+use crate::json::parse_json;
 use glam::DVec3;
 use irradia_scene::{Lens, RollingShutter};
 use serde::Deserialize;
@@ -83,6 +84,13 @@ pub struct CameraKeys {
     pub fl_y: Option<f64>,
     pub camera_angle_x: Option<f64>,
     pub camera_angle_y: Option<f64>,
+    /// instant-ngp's angles, degrees.
+    pub x_fov: Option<f64>,
+    pub y_fov: Option<f64>,
+    /// Lenses of instant-ngp that are not supported.
+    pub equirectangular: Option<bool>,
+    pub latlong: Option<bool>,
+    pub ftheta_p0: Option<f64>,
     pub cx: Option<f64>,
     pub cy: Option<f64>,
     pub k1: Option<f64>,
@@ -93,47 +101,12 @@ pub struct CameraKeys {
     pub p2: Option<f64>,
 }
 
-/// Parses a `transforms.json`. `NaN` and `Infinity`, which are not JSON but written by Python, are read as `None`.
+/// Parses a `transforms.json`.
 ///
 /// # Errors
 /// When it is not JSON, or lacks `frames`, a `file_path` or a `transform_matrix`; with line and column.
 pub fn parse_transforms(bytes: &[u8]) -> Result<Transforms, Malformed> {
-    let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
-    serde_json::from_slice(bytes).or_else(|error| {
-        let replaced = nulls_for_python_numbers(bytes);
-        serde_json::from_slice(&replaced).map_err(|_| Malformed(format!("not a usable transforms file: {error}")))
-    })
-}
-
-/// `null` for each `NaN`, `Infinity` and `-Infinity` outside strings.
-fn nulls_for_python_numbers(bytes: &[u8]) -> Vec<u8> {
-    let mut out = Vec::with_capacity(bytes.len());
-    let mut in_string = false;
-    let mut rest = bytes;
-    while let Some((first, after)) = rest.split_first() {
-        if !in_string
-            && let Some(after) = [&b"NaN"[..], b"-NaN", b"Infinity", b"-Infinity"]
-                .iter()
-                .find_map(|word| rest.strip_prefix(*word))
-        {
-            out.extend(b"null");
-            rest = after;
-            continue;
-        }
-        out.push(*first);
-        rest = after;
-        match first {
-            b'"' => in_string = !in_string,
-            b'\\' if in_string => {
-                if let Some((escaped, after)) = rest.split_first() {
-                    out.push(*escaped);
-                    rest = after;
-                }
-            }
-            _ => {}
-        }
-    }
-    out
+    parse_json(bytes, "transforms file")
 }
 
 impl CameraKeys {
@@ -141,12 +114,8 @@ impl CameraKeys {
     ///
     /// A frame's focal lengths and global ones of another kind are not mixed.
     pub(super) fn or(&self, others: &Self) -> Self {
-        let own_focal = self
-            .fl_x
-            .or(self.fl_y)
-            .or(self.camera_angle_x)
-            .or(self.camera_angle_y)
-            .is_some();
+        let [x, y] = self.angles();
+        let own_focal = self.fl_x.or(self.fl_y).or(x).or(y).is_some();
         let focal = if own_focal { self } else { others };
         Self {
             camera_model: self.camera_model.clone().or_else(|| others.camera_model.clone()),
@@ -157,6 +126,11 @@ impl CameraKeys {
             fl_y: focal.fl_y,
             camera_angle_x: focal.camera_angle_x,
             camera_angle_y: focal.camera_angle_y,
+            x_fov: focal.x_fov,
+            y_fov: focal.y_fov,
+            equirectangular: self.equirectangular.or(others.equirectangular),
+            latlong: self.latlong.or(others.latlong),
+            ftheta_p0: self.ftheta_p0.or(others.ftheta_p0),
             cx: self.cx.or(others.cx),
             cy: self.cy.or(others.cy),
             k1: self.k1.or(others.k1),
@@ -168,6 +142,21 @@ impl CameraKeys {
         }
     }
 
+    /// The fields of view, radians.
+    fn angles(&self) -> [Option<f64>; 2] {
+        [
+            self.camera_angle_x.or(self.x_fov.map(f64::to_radians)),
+            self.camera_angle_y.or(self.y_fov.map(f64::to_radians)),
+        ]
+    }
+
+    /// The name of its lens if it is one of instant-ngp's that are not supported. They have a focal length as well, without a meaning.
+    fn unsupported_lens(&self) -> Option<&'static str> {
+        let flags = [("equirectangular", self.equirectangular), ("latlong", self.latlong)];
+        let flagged = flags.into_iter().find(|(_, is_set)| *is_set == Some(true));
+        flagged.map(|(name, _)| name).or(self.ftheta_p0.map(|_| "ftheta"))
+    }
+
     /// The camera. Focal lengths in pixels take precedence over angles; a missing principal point is at the image's centre.
     ///
     /// Coefficients: `k1 k2 p1 p2` are OpenCV's, `k3` is its third radial one. A `k4` belongs to the fisheye model; for other
@@ -177,12 +166,16 @@ impl CameraKeys {
         if self.camera_model.as_deref() == Some("EQUIRECTANGULAR") {
             return Ok(DeclaredCamera::panorama());
         }
+        if let Some(lens) = self.unsupported_lens() {
+            return Err(Malformed(format!(
+                "the lens {lens} of instant-ngp is not supported; undistort the photographs, or set camera_model to EQUIRECTANGULAR if \
+                 they are panoramas"
+            )));
+        }
         let focal = match (self.fl_x, self.fl_y) {
             (Some(x), y) => Focal::Pixels([x, y.unwrap_or(x)]),
             (None, Some(y)) => Focal::Pixels([y, y]),
-            (None, None) if self.camera_angle_x.or(self.camera_angle_y).is_some() => {
-                Focal::Angles([self.camera_angle_x, self.camera_angle_y])
-            }
+            (None, None) if self.angles() != [None; 2] => Focal::Angles(self.angles()),
             (None, None) => {
                 return Err(Malformed(
                     "has no intrinsics; set fl_x (and fl_y, cx, cy, w, h) in pixels or camera_angle_x in radians, for \
@@ -298,6 +291,21 @@ mod tests {
             ..Default::default()
         };
         assert!(keys.camera().unwrap_err().to_string().contains("k4"));
+        let camera = |keys: &str| {
+            let text = format!(r#"{{{keys}, "frames": []}}"#);
+            parse_transforms(text.as_bytes()).unwrap().camera.camera()
+        };
+        let wide = camera(r#""x_fov": 90.0, "w": 100, "h": 50"#).unwrap();
+        assert!((wide.at_size(100, 50).fx - 50.0).abs() < 1e-4, "degrees");
+        for lens in [
+            r#""latlong": true"#,
+            r#""equirectangular": true"#,
+            r#""ftheta_p0": 0.1"#,
+        ] {
+            let error = camera(&format!(r#""fl_x": 50, {lens}"#)).unwrap_err().to_string();
+            assert!(error.contains("is not supported"), "{error}");
+        }
+        assert!(camera(r#""fl_x": 50, "latlong": false"#).is_ok());
         let fisheye = CameraKeys {
             is_fisheye: Some(true),
             ..keys

@@ -6,7 +6,7 @@ mod panorama;
 
 use crate::dataset::{SiblingFolder, colmap_orientation, is_image_name, list_files, oriented_size};
 use crate::error::read_file;
-use crate::image_file::{Colour, decode, decode_jpeg_scaled, decode_mask, read_header, read_metadata};
+use crate::image_file::{decode, decode_jpeg_scaled, decode_mask, read_header, read_metadata};
 use crate::photo::binarize;
 use crate::{FormatError, Pixels, write_png};
 pub use exif::{CameraTags, parse_camera_tags};
@@ -85,7 +85,7 @@ impl PhotoEntry {
             .find(|divisor| self.jpeg && longer_side / divisor >= min_side);
         match divisor {
             Some(divisor) => decode_jpeg_scaled(&self.path, divisor, self.orientation),
-            None => decode(&self.path, self.orientation, Colour::Keep),
+            None => decode(&self.path, self.orientation),
         }
     }
 

@@ -8,7 +8,7 @@ mod write;
 use super::declared::{
     DeclaredCamera, DeclaredDataset, DeclaredPoints, DeclaredPose, DeclaredView, Focal, lens_or_pinhole,
 };
-use super::files::{ImageFolder, choose_image_folder, find_image, relative_name};
+use super::files::{ImageFolder, choose_image_folder, find_image, locate_image, relative_name};
 use super::sibling_folder::SiblingFolder;
 use crate::error::read_and_parse;
 use crate::{FormatError, Malformed};
@@ -104,22 +104,28 @@ fn model_in(folder: &Path) -> Option<ModelFiles> {
     })
 }
 
-/// The complete models of `sparse/0`, `sparse/1`, .. in the first of [`MODELS_FOLDERS`] that has some: COLMAP writes one for each part of a
-/// scene that it cannot connect.
+/// The complete models of the numbered subfolders of the first of [`MODELS_FOLDERS`] that has some, in order: COLMAP writes one for each
+/// part of a scene that it cannot connect, of which users delete some.
 fn numbered_models(root: &Path) -> Vec<ModelFiles> {
     let models_in = |folder: &str| -> Vec<ModelFiles> {
-        let model = |i: usize| model_in(&root.join(folder).join(i.to_string()));
-        (0..MAX_MODELS).map_while(model).collect()
+        let folder = root.join(folder);
+        let entries = std::fs::read_dir(&folder).into_iter().flatten().flatten();
+        let number = |entry: std::fs::DirEntry| entry.file_name().to_str()?.parse::<u32>().ok();
+        let mut numbers: Vec<u32> = entries.filter_map(number).collect();
+        numbers.sort_unstable();
+        let model = |number: u32| model_in(&folder.join(number.to_string()));
+        numbers.into_iter().filter_map(model).take(MAX_MODELS).collect()
     };
     let mut found = MODELS_FOLDERS.into_iter().map(models_in);
     found.find(|models| !models.is_empty()).unwrap_or_default()
 }
 
-/// The first complete model of `sparse/0`, `sparse`, the folder itself and `colmap/sparse/0`.
+/// The first complete model of `sparse/0`, `sparse`, the folder itself, `colmap/sparse/0` and other numbered folders.
 pub(super) fn find_model(root: &Path) -> Option<ModelFiles> {
-    ["sparse/0", "sparse", "", "colmap/sparse/0"]
-        .into_iter()
+    let mut usual = ["sparse/0", "sparse", "", "colmap/sparse/0"].into_iter();
+    usual
         .find_map(|below| model_in(&root.join(below)))
+        .or_else(|| numbered_models(root).into_iter().next())
 }
 
 /// The model to read, which is the one with the most photographs, and a warning if there are several.
@@ -157,6 +163,20 @@ impl ModelFiles {
         read_and_parse(&self.path(table), if self.binary { binary } else { text })
     }
 
+    /// The points, which may be in the other format than the cameras.
+    fn points(&self) -> Result<Option<Vec<ColmapPoint>>, FormatError> {
+        let other = Self {
+            folder: self.folder.clone(),
+            binary: !self.binary,
+        };
+        let existing = [self, &other]
+            .into_iter()
+            .find(|files| files.path("points3D").is_file());
+        existing
+            .map(|files| files.read("points3D", binary::parse_points, text::parse_points))
+            .transpose()
+    }
+
     fn images(&self) -> Result<Vec<ColmapImage>, FormatError> {
         self.read("images", binary::parse_images, text::parse_images)
     }
@@ -187,11 +207,7 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
         cameras.insert(camera.id, declared);
     }
     let images = files.images()?;
-    let (points, index_of) = if files.path("points3D").is_file() {
-        point_cloud(files.read("points3D", binary::parse_points, text::parse_points)?)
-    } else {
-        Default::default()
-    };
+    let (points, index_of) = files.points()?.map(point_cloud).unwrap_or_default();
 
     let folder = choose_image_folder(root, downscale).unwrap_or(ImageFolder {
         name: String::new(),
@@ -208,12 +224,26 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
             );
             FormatError::malformed(&files.path("images"), message)
         })?;
-        let name = image.name.replace('\\', "/");
+        let declared_name = image.name.replace('\\', "/");
+        let photographs = root.join(&folder.name);
+        let direct = find_image(&photographs.join(&declared_name));
+        let (file, name) = match direct {
+            Some(file) => (Some(file), declared_name),
+            None => {
+                // The name may begin with the folder of the photographs, or be a path on another computer.
+                let file = [&folder.name, ""]
+                    .into_iter()
+                    .find_map(|folder| locate_image(root, &[folder], &declared_name));
+                let below = file.as_ref().and_then(|file| file.strip_prefix(&photographs).ok());
+                let name = below.map_or(declared_name, |below| relative_name(Path::new(""), below));
+                (file, name)
+            }
+        };
         let mut points_seen: Vec<u32> = image.points.iter().filter_map(|id| index_of.get(id)).copied().collect();
         points_seen.sort_unstable();
         points_seen.dedup();
         views.push(DeclaredView {
-            image: find_image(&root.join(&folder.name).join(&name)),
+            image: file,
             mask: masks.as_ref().and_then(|masks| masks.file_of(&name)),
             name: if folder.name.is_empty() {
                 name
@@ -243,7 +273,6 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
         root: root.to_owned(),
         views,
         points: Some(points),
-        ignores_exif: true,
         downscale: folder.downscale,
         warnings,
     })

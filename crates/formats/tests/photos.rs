@@ -270,7 +270,11 @@ fn phones_photographs_are_read_with_what_the_camera_wrote() {
     assert!(found.left_out[0].1.contains("not a readable"), "{:?}", found.left_out);
     let photo = &found.photos[0];
     assert_eq!((photo.width, photo.height, photo.up), (40, 30, None));
-    assert_eq!(photo.tags.focal, Some(0.75));
+    assert!(
+        (photo.tags.focal.unwrap() - 0.78).abs() < 1e-3,
+        "{:?}",
+        photo.tags.focal
+    );
     let read = photo.read(1).unwrap();
     assert_eq!((read.width, read.height, read.channels), (40, 30, 3));
     let off: u32 = read

@@ -5,7 +5,7 @@ use crate::{FormatError, write_atomic};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::metadata::Orientation;
 use image::{
-    DynamicImage, ExtendedColorType, GrayImage, ImageDecoder, ImageEncoder, ImageReader, Rgb32FImage, RgbImage,
+    DynamicImage, ExtendedColorType, GrayImage, ImageDecoder, ImageEncoder, ImageReader, Rgb, Rgb32FImage, RgbImage,
 };
 use irradia_scene::resize_area;
 use std::fs::File;
@@ -223,17 +223,21 @@ pub(crate) fn read_metadata(path: &Path) -> Metadata {
 
 /// The pixels, with `orientation` applied: three channels, or four if the file has alpha.
 pub(crate) fn decode(path: &Path, orientation: Orientation) -> Result<Pixels, FormatError> {
-    let (decoder, _) = open(path)?;
-    let image = DynamicImage::from_decoder(decoder).map_err(|error| undecodable(path, &error))?;
-    Ok(oriented_pixels(image, orientation))
+    Ok(pixels(decode_oriented(path, orientation)?.0))
+}
+
+/// The image with `orientation` applied, and whether it is a JPEG.
+fn decode_oriented(path: &Path, orientation: Orientation) -> Result<(DynamicImage, bool), FormatError> {
+    let (decoder, jpeg) = open(path)?;
+    let mut image = DynamicImage::from_decoder(decoder).map_err(|error| undecodable(path, &error))?;
+    image.apply_orientation(orientation);
+    Ok((image, jpeg))
 }
 
 /// The pixels of a mask, 0 to 255. Where masks are not black and white, black is ignored and all else is kept: labels (0, 1, 2, ..),
 /// colours and palettes, at any depth. The alpha of an image of a single colour is the mask.
 pub(crate) fn decode_mask(path: &Path, orientation: Orientation) -> Result<Pixels, FormatError> {
-    let (decoder, jpeg) = open(path)?;
-    let mut image = DynamicImage::from_decoder(decoder).map_err(|error| undecodable(path, &error))?;
-    image.apply_orientation(orientation);
+    let (image, jpeg) = decode_oriented(path, orientation)?;
     let (width, height) = (image.width(), image.height());
     let data = alpha_of_single_color(&image).unwrap_or_else(|| {
         // A JPEG's black is not exact, so its labels cannot be told from noise.
@@ -265,13 +269,13 @@ fn alpha_of_single_color(image: &DynamicImage) -> Option<Vec<u8>> {
 
 /// The values of a mask without losses: 255 for all that is not black if it holds labels or colours, otherwise its brightness.
 fn mask_values(image: &DynamicImage) -> Vec<u8> {
-    let pixels = image.to_rgb8();
-    if pixels.pixels().any(|pixel| grey(pixel.0).is_none()) {
-        let is_black = |channels: [u8; 3]| channels.iter().all(|channel| *channel < MIN_COLOR);
-        return pixels
-            .pixels()
-            .map(|pixel| if is_black(pixel.0) { 0 } else { 255 })
-            .collect();
+    if image.color().has_color() {
+        let pixels = image.to_rgb8();
+        if pixels.pixels().any(|pixel| grey(pixel.0).is_none()) {
+            let is_black = |channels: [u8; 3]| channels.iter().all(|channel| *channel < MIN_COLOR);
+            let value = |pixel: &Rgb<u8>| if is_black(pixel.0) { 0 } else { 255 };
+            return pixels.pixels().map(value).collect();
+        }
     }
     let levels = image.to_luma16();
     let has_labels = levels.iter().all(|level| *level < 1 << 15);
@@ -285,14 +289,14 @@ fn mask_values(image: &DynamicImage) -> Vec<u8> {
 
 /// The pixels of a HEIC image in memory.
 pub(crate) fn decode_heic(bytes: &[u8]) -> Result<Pixels, image::ImageError> {
-    let image = DynamicImage::from_decoder(HeicDecoder::new(bytes.to_vec())?)?;
-    Ok(oriented_pixels(image, Orientation::NoTransforms))
+    Ok(pixels(DynamicImage::from_decoder(HeicDecoder::new(bytes.to_vec())?)?))
 }
 
 /// The pixels of an `OpenEXR` image in memory.
 pub(crate) fn decode_exr(bytes: &[u8]) -> Result<Pixels, image::ImageError> {
-    let image = DynamicImage::from_decoder(ExrDecoder::new(Cursor::new(bytes))?)?;
-    Ok(oriented_pixels(image, Orientation::NoTransforms))
+    Ok(pixels(DynamicImage::from_decoder(ExrDecoder::new(Cursor::new(
+        bytes,
+    ))?)?))
 }
 
 /// The values of a grey image as stored (8 bits, 16 bits or `OpenEXR`): width, height and `[H, W]`.
@@ -315,9 +319,7 @@ pub(crate) fn decode_values(path: &Path, orientation: Orientation) -> Result<(u3
         let values = image.to_rgb32f().pixels().map(|pixel| pixel.0[0]).collect();
         return Ok((image.width(), image.height(), values));
     }
-    let (decoder, _) = open(path)?;
-    let mut image = DynamicImage::from_decoder(decoder).map_err(|error| undecodable(path, &error))?;
-    image.apply_orientation(orientation);
+    let (image, _) = decode_oriented(path, orientation)?;
     let (width, height) = (image.width(), image.height());
     let values: Vec<f32> = if image.color().bytes_per_pixel() > image.color().channel_count() {
         let rgb = image.to_rgb16();
@@ -360,9 +362,8 @@ fn grey<T: PartialEq + Copy>([red, green, blue]: [T; 3]) -> Option<T> {
     (red == green && green == blue).then_some(red)
 }
 
-/// `image` with `orientation` applied.
-fn oriented_pixels(mut image: DynamicImage, orientation: Orientation) -> Pixels {
-    image.apply_orientation(orientation);
+/// The pixels of `image`: three channels, or four if it has alpha.
+fn pixels(image: DynamicImage) -> Pixels {
     let (width, height) = (image.width(), image.height());
     let (channels, data) = if image.color().has_alpha() {
         (4, image.into_rgba8().into_raw())
@@ -411,8 +412,9 @@ pub(crate) fn decode_jpeg_scaled(path: &Path, divisor: u32, orientation: Orienta
         // Other pixel formats are rare: decoded at full size, then averaged.
         _ => None,
     };
-    if let Some(image) = image {
-        return Ok(oriented_pixels(image, orientation));
+    if let Some(mut image) = image {
+        image.apply_orientation(orientation);
+        return Ok(pixels(image));
     }
     let full = decode(path, orientation)?;
     let to = [full.width.div_ceil(divisor), full.height.div_ceil(divisor)];

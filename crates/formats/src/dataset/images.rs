@@ -2,7 +2,7 @@
 
 use super::declared::DeclaredDataset;
 use super::files::{find_image, is_image_name};
-use super::sibling_folder::{MAX_DEPTH, collect};
+use super::sibling_folder::files_below;
 use crate::FormatError;
 use std::cell::LazyCell;
 use std::collections::HashMap;
@@ -42,8 +42,7 @@ pub(super) struct PhotographsBelow(HashMap<String, Option<PathBuf>>);
 
 impl PhotographsBelow {
     pub fn find(folder: &Path) -> Self {
-        let mut by_path = HashMap::new();
-        collect(folder, folder, MAX_DEPTH, &is_image_name, &mut by_path);
+        let by_path = files_below(folder, is_image_name);
         let mut by_name: HashMap<String, Option<PathBuf>> = HashMap::new();
         let is_photograph = |path: &str| !OTHER_FOLDERS.iter().any(|start| path.starts_with(start));
         for (_, file) in by_path.into_iter().filter(|(path, _)| is_photograph(path)) {

@@ -70,8 +70,9 @@ pub(super) fn read(path: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
     let views = model.images.iter().enumerate().map(|(i, image)| {
         let name = image.name.replace('\\', "/");
         let image_path = locate_image(&root, &IMAGE_FOLDERS, &name);
-        // One that cannot be read is reported later.
-        let header = image_path.as_deref().and_then(|path| read_header(path).ok());
+        // Only distortion depends on the size. A photograph that cannot be read is reported later.
+        let distorted = image_path.as_deref().filter(|_| image.radial != 0.0);
+        let header = distorted.and_then(|path| read_header(path).ok());
         let camera = declared_camera(image, header.map(|header| (header.width, header.height)));
         DeclaredView {
             points_seen: points_seen.remove(&i).unwrap_or_default(),

@@ -6,7 +6,7 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 /// Maximum depth of the search, which a link back to a parent would otherwise make endless.
-pub(super) const MAX_DEPTH: u32 = 6;
+const MAX_DEPTH: u32 = 6;
 
 /// The files in a separate folder, by the image that they belong to.
 pub struct SiblingFolder {
@@ -38,11 +38,9 @@ impl SiblingFolder {
     /// The files that `keep` accepts in the first of these folders that exists.
     fn find(root: &Path, names: &[String], keep: impl Fn(&Path) -> bool) -> Option<Self> {
         let folder = names.iter().find(|name| root.join(name).is_dir())?;
-        let (mut by_stem, top) = (HashMap::new(), root.join(folder));
-        collect(&top, &top, MAX_DEPTH, &keep, &mut by_stem);
         Some(Self {
             folder: folder.clone(),
-            by_stem,
+            by_stem: files_below(&root.join(folder), keep),
         })
     }
 
@@ -104,8 +102,14 @@ pub(super) fn find_maps(declared: &mut DeclaredDataset) {
     }
 }
 
-/// The files that `keep` accepts in `folder` and its subfolders, by path below `top`, lower case, without extension.
-pub(super) fn collect(
+/// The files that `keep` accepts in `folder` and its subfolders, by path below it, lower case, without extension.
+pub(super) fn files_below(folder: &Path, keep: impl Fn(&Path) -> bool) -> HashMap<String, PathBuf> {
+    let mut by_stem = HashMap::new();
+    collect(folder, folder, MAX_DEPTH, &keep, &mut by_stem);
+    by_stem
+}
+
+fn collect(
     top: &Path,
     folder: &Path,
     depth: u32,

@@ -2,11 +2,10 @@
 
 use exif::{Exif, In, Reader, Tag, Value};
 
-/// Diagonal of a frame of 35 mm film, 36 mm x 24 mm, to which equivalent focal lengths refer (CIPA DCG-001).
-const FILM_DIAGONAL_MM: f64 = 43.267;
-/// Longer side of a sensor of 3:2 and of 4:3, relative to its diagonal.
-const LONG_SIDE_3_2: f64 = 0.832;
-const LONG_SIDE_4_3: f64 = 0.8;
+/// The longer side of a frame of 35 mm film, 36 mm x 24 mm, and of one of 4:3 with the same diagonal of 43.267 mm, to which equivalent
+/// focal lengths refer (CIPA DCG-001).
+const FILM_WIDTH_MM: f64 = 36.0;
+const FILM_WIDTH_4_3_MM: f64 = 0.8 * 43.267;
 
 /// The tags that describe the camera, and when and where the photograph was taken.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -95,7 +94,7 @@ fn focal(exif: &Exif, size: [u32; 2]) -> Option<f64> {
 fn equivalent_side_mm(size: [u32; 2]) -> f64 {
     let [short, long] = [size[0].min(size[1]), size[0].max(size[1])].map(f64::from);
     let is_3_2 = (long / short / 1.5 - 1.0).abs() < 0.03;
-    FILM_DIAGONAL_MM * if is_3_2 { LONG_SIDE_3_2 } else { LONG_SIDE_4_3 }
+    if is_3_2 { FILM_WIDTH_MM } else { FILM_WIDTH_4_3_MM }
 }
 
 fn gps(exif: &Exif) -> Option<[f64; 3]> {

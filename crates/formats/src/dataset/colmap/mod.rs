@@ -194,6 +194,20 @@ pub fn read_colmap_poses(root: &Path) -> Result<(PathBuf, Vec<ColmapCamera>, Vec
     Ok((files.folder, cameras, images))
 }
 
+/// The photograph that a model names, and its path below `folder`, the folder of the photographs in `root`. The name may begin with that
+/// folder, or be a path on another computer.
+fn locate_photograph(root: &Path, folder: &str, name: String) -> (Option<PathBuf>, String) {
+    let photographs = root.join(folder);
+    if let Some(file) = find_image(&photographs.join(&name)) {
+        return (Some(file), name);
+    }
+    let mut folders = [folder, ""].into_iter();
+    let file = folders.find_map(|folder| locate_image(root, &[folder], &name));
+    let below = file.as_ref().and_then(|file| file.strip_prefix(&photographs).ok());
+    let name = below.map_or(name, |below| relative_name(Path::new(""), below));
+    (file, name)
+}
+
 pub(super) fn read(root: &Path, downscale: f32) -> Result<DeclaredDataset, FormatError> {
     let Some((files, model_warning)) = largest_model(root)? else {
         return Err(FormatError::malformed(root, "contains no COLMAP model"));
@@ -224,21 +238,7 @@ pub(super) fn read(root: &Path, downscale: f32) -> Result<DeclaredDataset, Forma
             );
             FormatError::malformed(&files.path("images"), message)
         })?;
-        let declared_name = image.name.replace('\\', "/");
-        let photographs = root.join(&folder.name);
-        let direct = find_image(&photographs.join(&declared_name));
-        let (file, name) = match direct {
-            Some(file) => (Some(file), declared_name),
-            None => {
-                // The name may begin with the folder of the photographs, or be a path on another computer.
-                let file = [&folder.name, ""]
-                    .into_iter()
-                    .find_map(|folder| locate_image(root, &[folder], &declared_name));
-                let below = file.as_ref().and_then(|file| file.strip_prefix(&photographs).ok());
-                let name = below.map_or(declared_name, |below| relative_name(Path::new(""), below));
-                (file, name)
-            }
-        };
+        let (file, name) = locate_photograph(root, &folder.name, image.name.replace('\\', "/"));
         let mut points_seen: Vec<u32> = image.points.iter().filter_map(|id| index_of.get(id)).copied().collect();
         points_seen.sort_unstable();
         points_seen.dedup();

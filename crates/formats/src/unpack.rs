@@ -20,17 +20,11 @@ impl<'a> Gunzip<'a> {
         read_exactly(&mut self.0, count, "gzip")
     }
 
-    /// Reads what follows the last value, up to 64 KiB, so that the checksum is compared.
-    pub fn finish(mut self) -> Result<(), Malformed> {
-        let mut rest = [0; 1024];
-        for _ in 0..64 {
-            match self.0.read(&mut rest) {
-                Ok(0) => break,
-                Ok(_) => {}
-                Err(error) => return Err(damaged("gzip", &error)),
-            }
-        }
-        Ok(())
+    /// What follows the last value, up to 64 KiB; at the end of the stream, its checksum is compared.
+    pub fn finish(self) -> Result<Vec<u8>, Malformed> {
+        let mut rest = Vec::new();
+        let read = self.0.take(1 << 16).read_to_end(&mut rest);
+        read.map(|_| rest).map_err(|error| damaged("gzip", &error))
     }
 }
 

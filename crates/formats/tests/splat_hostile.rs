@@ -122,11 +122,14 @@ fn archives_that_unfold_without_end() {
             &format!("\"scenes\":[{{\"nodes\":[{}]}}]", numbers.join(",")),
         );
     let mut bytes = b"glTF\x02\0\0\0".to_vec();
-    bytes.extend((text.len() as u32 + 20).to_le_bytes());
+    bytes.extend(((20 + text.len() + glb[20 + json..].len()) as u32).to_le_bytes());
     bytes.extend((text.len() as u32).to_le_bytes());
     bytes.extend(b"JSON");
     bytes.extend(text.bytes());
     bytes.extend(&glb[20 + json..]);
+    assert_eq!(parse::glb(&bytes).map(|cloud| cloud.len()), Ok(300_000));
+    // What follows the declared length is not part of the file.
+    bytes.extend([7; 13]);
     assert_eq!(parse::glb(&bytes).map(|cloud| cloud.len()), Ok(300_000));
 }
 

@@ -5,6 +5,8 @@ use irradia_formats::{
 };
 use irradia_scene::{GaussianCloud, Rng, sh};
 use irradia_testkit::shared;
+use std::fs;
+use std::io::{Read, Write};
 use std::path::Path;
 
 /// Splats at distinct places in no order, with everything in the range that scenes have.
@@ -417,5 +419,120 @@ fn the_same_scene_in_two_formats_is_the_same() {
         colors.sort_unstable();
         expected.sort_unstable();
         assert_eq!(colors.len(), expected.len(), "{name}");
+    }
+}
+
+/// The splats in a text PLY with `properties` of these types and names, and `rows` of their values.
+fn text_ply(properties: &str, rows: &[&str]) -> GaussianCloud {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.ply");
+    let properties: String = properties.split(", ").map(|p| format!("property {p}\n")).collect();
+    let header = format!(
+        "ply\nformat ascii 1.0\nelement vertex {}\n{properties}end_header\n",
+        rows.len()
+    );
+    fs::write(&path, header + &rows.join("\n") + "\n").unwrap();
+    read_splats(&path).unwrap()
+}
+
+const SHAPE: &str =
+    "float opacity, float scale_0, float scale_1, float scale_2, float rot_0, float rot_1, float rot_2, float rot_3";
+
+#[test]
+fn colours_in_place_of_harmonics_and_rotations_of_length_zero_are_read() {
+    // Nerfstudio's export without harmonics.
+    let cloud = text_ply(
+        &format!("float x, float y, float z, {SHAPE}, uchar red, uchar green, uchar blue, float label"),
+        &["1 2 3 0 -1 -1 -1 0 0 0 0 255 0 51 7"],
+    );
+    assert_eq!(cloud.quats, [[1.0, 0.0, 0.0, 0.0]]);
+    let colors: Vec<f32> = cloud.sh.iter().map(|dc| sh::color_from_dc(*dc)).collect();
+    for (color, expected) in colors.iter().zip([1.0, 0.0, 0.2]) {
+        assert!((color - expected).abs() < 1e-6, "{colors:?}");
+    }
+    assert_eq!(
+        cloud.extra.iter().map(|c| c.name.as_str()).collect::<Vec<_>>(),
+        ["label"]
+    );
+}
+
+#[test]
+fn doubles_of_other_programs_far_from_the_origin_keep_their_precision() {
+    let properties = format!("double x, double y, double z, float f_dc_0, float f_dc_1, float f_dc_2, {SHAPE}");
+    let row = |x: f64, y: f64| format!("{x} {y} 100.5 0 0 0 0 -1 -1 -1 1 0 0 0");
+    let (a, b) = (row(400_000.0, 5_200_000.031_25), row(400_001.5, 5_199_999.0));
+    let cloud = text_ply(&properties, &[&a, &b]);
+    let at = |cloud: &GaussianCloud, i: usize| {
+        cloud
+            .world_from_dataset
+            .invert(glam::DVec3::from(cloud.means[i].map(f64::from)))
+    };
+    assert_eq!(at(&cloud, 0), glam::DVec3::new(400_000.0, 5_200_000.031_25, 100.5));
+    // Also after it was written and read.
+    let again = round_trip("a.ply", &cloud, WriteOptions::default());
+    assert_eq!(at(&again, 1), glam::DVec3::new(400_001.5, 5_199_999.0, 100.5));
+    // Near the origin, the coordinates are those of the file.
+    let near = text_ply(&properties, &[&row(1.5, 2.0), &row(-2.5, 0.0)]);
+    assert_eq!(
+        (near.means[0], near.world_from_dataset.is_identity()),
+        ([1.5, 2.0, 100.5], true)
+    );
+}
+
+#[test]
+fn splats_without_thickness_stay_thin() {
+    let mut cloud = scene(300, 0);
+    cloud
+        .log_scales
+        .iter_mut()
+        .for_each(|scales| scales[2] = f32::NEG_INFINITY);
+    for name in ["a.sog", "a.spz", "a.compressed.ply", "a.ksplat", "a.glb"] {
+        let read = round_trip(name, &cloud, WriteOptions::default());
+        assert!(read.log_scales.iter().all(|scales| scales[2] < -9.9), "{name}");
+    }
+}
+
+#[test]
+fn splats_that_are_never_seen_do_not_blur_the_colours_of_others() {
+    let mut cloud = scene(200, 0);
+    let alone = differences(&cloud, &round_trip("a.compressed.ply", &cloud, WriteOptions::default()));
+    (cloud.opacity_logits[7], cloud.sh[21]) = (-9.0, 1e4);
+    let mut read = round_trip("a.compressed.ply", &cloud, WriteOptions::default());
+    let order = by_x(&read);
+    let unseen = by_x(&cloud).iter().position(|i| *i == 7).unwrap();
+    read.sh[3 * order[unseen]] = cloud.sh[21];
+    let both = differences(&cloud, &read);
+    assert!(both.color <= 1.1 * alone.color, "{both:?} {alone:?}");
+}
+
+#[test]
+fn axes_are_also_declared_behind_the_arrays_of_older_files() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.spz");
+    let cloud = scene(50, 1);
+    let options = WriteOptions {
+        spz_version: SpzVersion::V3,
+        ..WriteOptions::default()
+    };
+    write_splats_with(&path, &cloud, &options).unwrap();
+    let mut bytes = Vec::new();
+    let packed = fs::read(&path).unwrap();
+    flate2::read::GzDecoder::new(&packed[..])
+        .read_to_end(&mut bytes)
+        .unwrap();
+    // The flag, and the Adobe extension with the axes right, down, front.
+    bytes[14] |= 2;
+    for number in [0xadbe_0003u32, 4, 6] {
+        bytes.extend(number.to_le_bytes());
+    }
+    let plain = read_splats(&path).unwrap();
+    let mut gzip = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    gzip.write_all(&bytes).unwrap();
+    for file in [gzip.finish().unwrap(), bytes] {
+        fs::write(&path, file).unwrap();
+        let read = read_splats(&path).unwrap();
+        for (a, b) in read.means.iter().zip(&plain.means) {
+            assert_eq!(*a, [b[0], -b[1], -b[2]]);
+        }
     }
 }

@@ -11,7 +11,7 @@ use irradia_edit::{Applied, Draft, Edit, EditList, Provenance, Transform, apply}
 use irradia_formats::{
     SplatFile, SplatFormat, StagedFile, WriteOptions, encode_splats, read_splat_file, write_splats, write_splats_with,
 };
-use irradia_scene::GaussianCloud;
+use irradia_scene::{ExtraColumn, GaussianCloud};
 use irradia_splat::Splats;
 use irradia_train::checkpoint::{splats_of, with_splats};
 use std::cell::RefCell;
@@ -22,11 +22,15 @@ use std::path::{Path, PathBuf};
 
 /// The list of edits beside an edited scene.
 pub const EDITS: &str = "edits.toml";
+/// Files beside a scene that are needed to render it.
+const RENDERING: [&str; 3] = ["recipe.toml", SKY, VIGNETTE];
 
 /// A scene in memory with its edits, from a splat file or a run.
 pub struct Editing {
     /// The file of the scene.
     path: PathBuf,
+    /// The files of merged scenes.
+    merged: Vec<PathBuf>,
     draft: Draft,
     list: EditList,
     applied: Vec<AppliedEdit>,
@@ -68,6 +72,7 @@ impl Editing {
             notes,
             draft,
             path,
+            merged: Vec::new(),
             list: EditList::default(),
             applied: Vec::new(),
             moved: Transform::IDENTITY,
@@ -99,10 +104,14 @@ impl Editing {
         for edit in &list.edits {
             let before = self.draft.len();
             let antialiased = self.draft.cloud.antialiased;
-            let notes = RefCell::new(Vec::new());
+            let columns: Vec<ExtraColumn> = self.draft.cloud.extra.iter().map(|column| column.zeros(0)).collect();
+            let (notes, merged) = (RefCell::new(Vec::new()), RefCell::new(Vec::new()));
             let open = |file: &str| {
-                let other = open_scene(file, &self.path)?;
-                notes.borrow_mut().extend(merge_notes(file, &other, antialiased));
+                let (path, other) = open_scene(file, &self.path)?;
+                notes
+                    .borrow_mut()
+                    .extend(merge_notes(file, &other, antialiased, &columns));
+                merged.borrow_mut().push(path);
                 Ok(other.cloud)
             };
             let Applied {
@@ -113,6 +122,7 @@ impl Editing {
                 ..
             } = apply(&mut self.draft, edit, &open)?;
             self.notes.extend(notes.into_inner());
+            self.merged.extend(merged.into_inner());
             if let Some(moved) = moved {
                 self.moved = self.moved.then(&moved);
             }
@@ -140,10 +150,9 @@ impl Editing {
             SplatFormat::of(output)?;
         }
         let file = if is_file { output.to_owned() } else { output.join(SCENE) };
-        check_not_overwritten(&self.path, &file)?;
-        if !is_file && output.join("run.json").exists() {
-            let message = format!("{} holds a run: name another folder", output.display());
-            return Err(RunError::Refused(message));
+        self.check_output(&file)?;
+        if !is_file {
+            check_folder(output)?;
         }
         let splits = self.split_files(&file)?;
         let mut notes = Vec::new();
@@ -152,14 +161,13 @@ impl Editing {
             let folder = RunFolder::at(output);
             let cameras = (CAMERAS, moved_cameras_json(&self.path, &self.moved));
             // Rendering needs these.
-            let others =
-                ["recipe.toml", SKY, VIGNETTE].map(|name| (name, fs::read(self.path.with_file_name(name)).ok()));
+            let others = RENDERING.map(|name| (name, fs::read(self.path.with_file_name(name)).ok()));
             for (name, content) in iter::once(cameras).chain(others) {
-                let of_another_scene = folder.file(name);
+                let of_scene_before = folder.file(name);
                 match content {
                     Some(content) => folder.write(name, &content)?,
-                    None if of_another_scene.exists() => {
-                        fs::remove_file(&of_another_scene).map_err(RunError::io("remove", &of_another_scene))?;
+                    None if of_scene_before.exists() => {
+                        fs::remove_file(&of_scene_before).map_err(RunError::io("remove", &of_scene_before))?;
                     }
                     None => {}
                 }
@@ -180,6 +188,16 @@ impl Editing {
             hidden => notes.push(format!("{hidden} hidden splats left out")),
         }
         Ok(notes)
+    }
+
+    /// Rejects an output that would replace the scene or one that was merged into it.
+    ///
+    /// # Errors
+    /// When it would.
+    pub fn check_output(&self, output: &Path) -> Result<(), RunError> {
+        iter::once(&self.path)
+            .chain(&self.merged)
+            .try_for_each(|input| check_not_overwritten(input, output))
     }
 
     /// Overwrites the scene of its run with the edited one, and appends the edits to the run's `edits.toml`. The latest checkpoint is
@@ -260,7 +278,7 @@ impl Editing {
         draft.photographs = self.draft.photographs.clone();
         let mut total = Provenance::identity(draft.len());
         for edit in &self.list.edits {
-            let open = |file: &str| Ok(open_scene(file, &self.path)?.cloud);
+            let open = |file: &str| Ok(open_scene(file, &self.path)?.1.cloud);
             total = total.then(&apply(&mut draft, edit, &open)?.provenance);
         }
         draft.cloud.set_degree(degree);
@@ -275,7 +293,7 @@ impl Editing {
     /// The scenes that were split off and their files, beside `file`.
     ///
     /// # Errors
-    /// When two of them, or one and the scene itself, would have the same file.
+    /// When two of them, or one and the scene itself, would have the same file, or one would replace a merged scene.
     fn split_files(&self, file: &Path) -> Result<Vec<(PathBuf, &GaussianCloud)>, RunError> {
         let mut files: Vec<(PathBuf, &GaussianCloud)> = Vec::new();
         for (name, cloud) in &self.splits {
@@ -295,6 +313,7 @@ impl Editing {
                     path.display()
                 )));
             }
+            self.check_output(&path)?;
             files.push((path, cloud));
         }
         Ok(files)
@@ -327,20 +346,42 @@ impl Editing {
     }
 }
 
-/// The scene `file`, looked up in the current folder, then beside the scene `path`.
-fn open_scene(file: &str, path: &Path) -> Result<SplatFile, String> {
+/// Rejects a folder with files that an edited scene's folder also has, unless they are an edited scene's.
+fn check_folder(folder: &Path) -> Result<(), RunError> {
+    if folder.join("run.json").exists() {
+        let message = format!("{} holds a run: name another folder", folder.display());
+        return Err(RunError::Refused(message));
+    }
+    let is_list = |path: PathBuf| fs::read_to_string(path).is_ok_and(|text| EditList::parse(&text).is_ok());
+    if folder.join(SCENE).is_file() && is_list(folder.join(EDITS)) {
+        return Ok(());
+    }
+    let mut names = [CAMERAS, EDITS].into_iter().chain(RENDERING);
+    match names.find(|name| folder.join(name).exists()) {
+        Some(name) => Err(RunError::Refused(format!(
+            "{} would be replaced, and {} is not the folder of an edited scene: name another folder",
+            folder.join(name).display(),
+            folder.display()
+        ))),
+        None => Ok(()),
+    }
+}
+
+/// The scene `file` and its path, looked up in the current folder, then beside the scene `path`.
+fn open_scene(file: &str, path: &Path) -> Result<(PathBuf, SplatFile), String> {
     let here = Path::new(file);
     let path = if here.exists() {
         scene_path(here)
     } else {
         scene_path(&path.with_file_name(file))
     };
-    read_splat_file(&path).map_err(|error| error.to_string())
+    let scene = read_splat_file(&path).map_err(|error| error.to_string())?;
+    Ok((path, scene))
 }
 
-/// What was left out of the merged scene `file`, and whether its splats look different in a scene that is `antialiased` or not; a line
-/// each.
-pub fn merge_notes(file: &str, other: &SplatFile, antialiased: bool) -> Vec<String> {
+/// What was left out of the merged scene `file`, whether its splats look different in a scene that is `antialiased` or not, and which of
+/// its numbers have no place in that scene's extra `columns`; a line each.
+pub fn merge_notes(file: &str, other: &SplatFile, antialiased: bool, columns: &[ExtraColumn]) -> Vec<String> {
     let difference = match (other.cloud.antialiased, antialiased) {
         (true, false) => Some("with Mip-Splatting's filter, this scene without: its smallest splats become too opaque"),
         (false, true) => {
@@ -349,6 +390,18 @@ pub fn merge_notes(file: &str, other: &SplatFile, antialiased: bool) -> Vec<Stri
         _ => None,
     };
     let difference = difference.map(|difference| format!("trained {difference}"));
-    let notes = other.warnings().into_iter().chain(difference);
+    // A file has one type for each name.
+    let is_lost = |column: &&ExtraColumn| {
+        let own = columns.iter().find(|own| own.name == column.name);
+        own.is_some_and(|own| !own.is_like(column))
+    };
+    let lost: Vec<&str> = (other.cloud.extra.iter().filter(is_lost))
+        .map(|column| column.name.as_str())
+        .collect();
+    let lost = (!lost.is_empty()).then(|| {
+        let names = lost.join(", ");
+        format!("properties that have another type in this scene become zero: {names}")
+    });
+    let notes = other.warnings().into_iter().chain(difference).chain(lost);
     notes.map(|note| format!("{file}: {note}")).collect()
 }

@@ -58,10 +58,14 @@ pub(crate) fn level_files(path: &Path) -> impl Iterator<Item = PathBuf> {
     (1..=LEVELS).map_while(move |level| level_file(path, level).ok())
 }
 
-/// Writes a scene like [`write_splats_with`], and removes the levels beside it, which belong to the scene that it replaces.
+/// Writes a scene like [`write_splats_with`], and removes the levels of the scene that it replaces. If it replaces none, files with the
+/// names of levels are somebody else's and stay: [`read_levels`] ignores levels that do not fit.
 pub(crate) fn write_scene(path: &Path, cloud: &GaussianCloud, options: &WriteOptions) -> Result<Vec<String>, RunError> {
+    let replaces = path.is_file();
     let notes = write_splats_with(path, cloud, options)?;
-    remove_levels(path)?;
+    if replaces {
+        remove_levels(path)?;
+    }
     Ok(notes)
 }
 
@@ -212,5 +216,20 @@ mod tests {
             "{error}"
         );
         assert!(read_levels(&folder.path().join("b.ply"), count).unwrap().is_empty());
+        // Levels go with the scene that is replaced; files that only look like levels stay.
+        let single = GaussianCloud {
+            means: vec![[0.0; 3]],
+            quats: vec![[1.0, 0.0, 0.0, 0.0]],
+            log_scales: vec![[0.0; 3]],
+            opacity_logits: vec![0.0],
+            sh: vec![0.0; 3],
+            ..GaussianCloud::default()
+        };
+        let like_a_level = folder.path().join("c.lod1.ply");
+        write_splats(&like_a_level, &single).unwrap();
+        for name in ["a.ply", "c.ply"] {
+            write_scene(&folder.path().join(name), &single, &WriteOptions::default()).unwrap();
+        }
+        assert!(like_a_level.is_file() && !level.exists());
     }
 }

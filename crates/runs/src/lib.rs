@@ -86,7 +86,7 @@ pub use irradia_train as train;
 pub use journal::logged_errors;
 pub use levels::{LEVELS, Level, level_file, read_levels, write_levels};
 pub use orbit::OrbitGeometry;
-pub use path::{CameraPath, Film, PathKey};
+pub use path::{CameraPath, FRAME_SIDE, Film, PathKey};
 pub use photographs::photographs_of;
 pub use pose::{
     AttemptReport, CameraReport, DoctorInput, DoctorReport, Finding, KnownDistance, LeftOutPhoto, MIN_POSED_FRACTION,

@@ -27,6 +27,8 @@ const MAX_APPROACH_FRACTION: f32 = 0.3;
 const RISE_FRACTION: f32 = 0.3;
 /// Range of frames per second.
 const FPS_RANGE: std::ops::RangeInclusive<f32> = 0.1..=240.0;
+/// Range of the width and height of a frame, pixels.
+pub const FRAME_SIDE: std::ops::RangeInclusive<u32> = 1..=16384;
 
 /// A camera at a point in time.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -64,6 +66,12 @@ pub struct CameraPath {
 struct Nerfstudio {
     #[serde(default)]
     fps: Option<f32>,
+    #[serde(default)]
+    camera_type: Option<String>,
+    #[serde(default)]
+    render_width: Option<u32>,
+    #[serde(default)]
+    render_height: Option<u32>,
     camera_path: Vec<NerfstudioCamera>,
 }
 
@@ -87,14 +95,16 @@ pub struct Film {
 impl Film {
     /// Reads a path saved by the viewer, or a `camera_path.json` of nerfstudio. Both are in the coordinates of the photographs, provided that
     /// nerfstudio kept these. `world_from_photographs` maps them to the scene's world, also if the whole scene was moved
-    /// ([`moved_from_run`](crate::moved_from_run)). Frames have `width` x `height` pixels.
+    /// ([`moved_from_run`](crate::moved_from_run)). Width and height of the frames, pixels, are `size`, otherwise those in the file,
+    /// otherwise `default_size`.
     ///
     /// # Errors
-    /// When the file cannot be read, or is not such a path.
+    /// When the file cannot be read, or is not a path of pinhole cameras.
     pub fn read(
         path: &Path,
         world_from_photographs: &Transform,
-        (width, height): (u32, u32),
+        size: Option<(u32, u32)>,
+        default_size: (u32, u32),
     ) -> Result<Self, RunError> {
         let text = fs::read_to_string(path).map_err(RunError::io("read", path))?;
         let wrong = |reason: &str| RunError::Damaged {
@@ -111,6 +121,15 @@ impl Film {
             if file.camera_path.len() > MAX_FRAMES {
                 return Err(wrong(TOO_MANY_FRAMES));
             }
+            let camera_type = file.camera_type.as_deref().unwrap_or("perspective");
+            if !camera_type.eq_ignore_ascii_case("perspective") {
+                return Err(wrong(&format!(
+                    "its cameras are of the type {camera_type}; only perspective ones are rendered"
+                )));
+            }
+            let in_file = file.render_width.zip(file.render_height);
+            let in_file = in_file.filter(|(w, h)| FRAME_SIDE.contains(w) && FRAME_SIDE.contains(h));
+            let (width, height) = size.or(in_file).unwrap_or(default_size);
             let cameras: Option<Vec<Camera>> = file
                 .camera_path
                 .iter()
@@ -125,7 +144,7 @@ impl Film {
             serde_json::from_value(value).map_err(|error| wrong(&format!("not a camera path: {error}")))?;
         path.keys.iter_mut().for_each(|key| key.move_by(world_from_photographs));
         path.check().map_err(wrong)?;
-        Ok(path.film((width, height)))
+        Ok(path.film(size.unwrap_or(default_size)))
     }
 
     /// `frames` cameras on a circle around the scene.
@@ -605,7 +624,7 @@ mod tests {
         let file = folder.path().join("path.json");
         let write = |text: &str| fs::write(&file, text).expect("written");
         write(&serde_json::to_string(&path(false)).expect("plain data"));
-        let film = Film::read(&file, &Transform::IDENTITY, (64, 48)).expect("a path");
+        let film = Film::read(&file, &Transform::IDENTITY, None, (64, 48)).expect("a path");
         assert_eq!((film.cameras.len(), film.fps), (46, 10.0));
         write(
             r#"{"fps": 24, "render_width": 5, "camera_path": [
@@ -615,15 +634,29 @@ mod tests {
             scale: 0.5,
             center: DVec3::new(1.0, 0.0, -1.0),
         };
-        let scaled = Film::read(&file, &Transform::to_world(&world), (64, 48)).expect("a path");
+        let scaled = Film::read(&file, &Transform::to_world(&world), None, (64, 48)).expect("a path");
         assert_eq!(scaled.cameras[0].pose.position, Vec3::new(1.0, 2.0, 3.0));
-        let film = Film::read(&file, &Transform::IDENTITY, (64, 48)).expect("a path");
+        let film = Film::read(&file, &Transform::IDENTITY, None, (64, 48)).expect("a path");
         let camera = film.cameras[0];
         assert_eq!((film.fps, camera.pose.position), (24.0, Vec3::new(3.0, 4.0, 5.0)));
         // OpenGL looks along -z with y up.
         assert!((camera.pose.rotation * Vec3::Z + Vec3::Z).length() < 1e-5);
         assert!((camera.pose.rotation * Vec3::Y + Vec3::Y).length() < 1e-5);
         assert!((camera.intrinsics.fy - 24.0).abs() < 1e-3);
+        // The size is the file's, unless one is asked for.
+        let own_size = |more: &str, size| {
+            write(&format!(
+                r#"{{"render_width": 60, "render_height": 40, {more}
+                "camera_path": [{{"camera_to_world": [1,0,0,3, 0,1,0,4, 0,0,1,5], "fov": 90}}]}}"#
+            ));
+            let film = Film::read(&file, &Transform::IDENTITY, size, (64, 48));
+            film.map(|film| film.cameras[0].intrinsics.width)
+        };
+        assert_eq!(own_size("", None).expect("a path"), 60);
+        assert_eq!(own_size("", Some((30, 20))).expect("a path"), 30);
+        assert_eq!(own_size(r#""camera_type": "perspective","#, None).expect("a path"), 60);
+        let error = own_size(r#""camera_type": "fisheye","#, None).expect_err("no pinholes");
+        assert!(error.to_string().contains("type fisheye"), "{error}");
     }
 
     #[test]
@@ -642,7 +675,7 @@ mod tests {
             scale: 0.1,
             center: far,
         };
-        let film = Film::read(&file, &moved.then(&Transform::to_world(&world)), (64, 48)).expect("a path");
+        let film = Film::read(&file, &moved.then(&Transform::to_world(&world)), None, (64, 48)).expect("a path");
         for (i, camera) in film.cameras.iter().enumerate() {
             let unmoved = path(false).camera(i as f32 / 10.0, 64, 48);
             let expected = 0.2 * (turn.as_quat() * unmoved.pose.position);
@@ -672,7 +705,7 @@ mod tests {
             good.replacen("[0.0,0.0,-0.0]", "[1e300,0.0,0.0]", 1),
         ] {
             fs::write(&file, &text).expect("written");
-            let error = Film::read(&file, &Transform::IDENTITY, (8, 8))
+            let error = Film::read(&file, &Transform::IDENTITY, None, (8, 8))
                 .expect_err(&text)
                 .to_string();
             assert!(!error.contains('\n') && error.contains("path.json"), "{error}");

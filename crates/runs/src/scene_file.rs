@@ -17,7 +17,7 @@ use irradia_train::socket::{Vignette, background_of_sky};
 use irradia_train::{Recipe, TrainError, field_file};
 use std::borrow::Cow;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 use std::sync::Arc;
 
 /// Splats, with or without a residual field, or a radiance field, with render options and the training cameras.
@@ -141,12 +141,32 @@ pub fn check_not_overwritten(scene: &Path, output: &Path) -> Result<(), RunError
     }
 }
 
-/// Whether both paths lead to the same existing file or folder.
+/// Whether both paths lead to the same file or folder, which may not exist yet.
 pub(crate) fn same_file(a: &Path, b: &Path) -> bool {
-    match (a.canonicalize(), b.canonicalize()) {
-        (Ok(a), Ok(b)) => a == b,
-        _ => false,
+    resolved(a) == resolved(b)
+}
+
+/// `path` without links, `.` and `..`; folders that do not exist yet have no links.
+fn resolved(path: &Path) -> PathBuf {
+    if let Ok(resolved) = path.canonicalize() {
+        return resolved;
     }
+    let Some(parent) = path.parent() else {
+        return path.to_owned();
+    };
+    let mut folder = resolved(if parent.as_os_str().is_empty() {
+        Path::new(".")
+    } else {
+        parent
+    });
+    match path.components().next_back() {
+        Some(Component::Normal(name)) => folder.push(name),
+        Some(Component::ParentDir) => {
+            folder.pop();
+        }
+        _ => {}
+    }
+    folder
 }
 
 /// The field in a file.

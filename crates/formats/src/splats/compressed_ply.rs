@@ -7,7 +7,9 @@
 
 use crate::Malformed;
 use crate::ply::{Column, Ply, Rows};
-use crate::splats::quantize::{from_smallest_three, from_unorm, logits_of_bytes, opacity_byte, smallest_three, unorm};
+use crate::splats::quantize::{
+    MAX_LOG_SCALE, from_smallest_three, from_unorm, logits_of_bytes, opacity_byte, smallest_three, unorm,
+};
 use crate::splats::rows::{decode_splats, encode_rows, morton_order};
 use irradia_scene::{GaussianCloud, sh};
 use rayon::prelude::*;
@@ -19,8 +21,6 @@ pub(crate) const CHUNK_ELEMENT: &str = "chunk";
 const CHUNK_SIZE: usize = 256;
 /// Coefficients above DC are from `-SH_RANGE` to `SH_RANGE`.
 const SH_RANGE: f32 = 4.0;
-/// Bounds of ln scale that other readers accept: an infinite bound would turn its whole chunk into NaNs.
-const MAX_LOG_SCALE: f32 = 20.0;
 
 const BOUND_PROPERTIES: [&str; 12] = [
     "min_x",
@@ -204,11 +204,14 @@ pub(crate) fn write(out: &mut dyn Write, cloud: &GaussianCloud) -> io::Result<()
     let ranges: Vec<[Range; 3]> = order
         .par_chunks(CHUNK_SIZE)
         .map(|chunk| {
-            let indices = || chunk.iter().map(|i| *i as usize);
+            // Splats that are never seen do not make the steps of the others coarser.
+            let is_seen = |i: &&u32| opacity_byte(cloud.opacity_logits[**i as usize]) > 0;
+            let any_seen = chunk.iter().any(|i| is_seen(&i));
+            let members = || chunk.iter().filter(|i| !any_seen || is_seen(i));
             [
-                Range::of(indices().map(|i| cloud.means[i])),
-                Range::of(indices().map(|i| cloud.log_scales[i])).clamped(MAX_LOG_SCALE),
-                Range::of(chunk.iter().map(|i| color(*i))),
+                Range::of(members().map(|i| cloud.means[*i as usize])),
+                Range::of(members().map(|i| cloud.log_scales[*i as usize])).clamped(MAX_LOG_SCALE),
+                Range::of(members().map(|i| color(*i))),
             ]
         })
         .collect();

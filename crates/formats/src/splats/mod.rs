@@ -153,11 +153,6 @@ impl SplatFormat {
         }
     }
 
-    /// The largest coordinate of a position that the format holds, if it is one that a scene may exceed.
-    fn max_coordinate(self) -> Option<f32> {
-        matches!(self, Self::Spz | Self::GlbSpz).then_some(spz::MAX_COORDINATE)
-    }
-
     /// Whether the format records that a scene was trained with the Mip-Splatting filters.
     fn holds_antialiased(self) -> bool {
         matches!(self, Self::Ply | Self::Spz | Self::GlbSpz | Self::Sog | Self::SogFolder)
@@ -287,6 +282,7 @@ impl SplatFile {
     /// Leaves out the splats of `cloud` that cannot be drawn.
     fn of(format: SplatFormat, mut cloud: GaussianCloud) -> Self {
         let left_out = rows::remove_invalid(&mut cloud);
+        rows::define_rotations(&mut cloud);
         Self {
             format,
             cloud,
@@ -512,13 +508,14 @@ pub fn write_splats_with(
         let names: Vec<&str> = cloud.extra.iter().map(|column| column.name.as_str()).collect();
         notes.push(format!("properties that only PLY keeps: {}", names.join(", ")));
     }
-    if let Some(limit) = format.max_coordinate() {
+    if matches!(format, SplatFormat::Spz | SplatFormat::GlbSpz) {
+        let limit = spz::max_coordinate(&cloud.means, options.quality);
         let is_beyond = |mean: &&[f32; 3]| mean.iter().any(|value| value.abs() > limit);
         let beyond = cloud.means.iter().filter(is_beyond).count();
         if beyond > 0 {
             notes.push(format!(
-                "{beyond} of {} splats are farther from the origin than the {limit} units that SPZ holds, and are moved to that \
-                 distance",
+                "{beyond} of {} splats are farther from the origin than the {limit:.0} units that SPZ holds without coarser \
+                 positions, and are moved to that distance",
                 cloud.len()
             ));
         }
@@ -700,9 +697,9 @@ mod tests {
             .unwrap()
         };
         for suffix in [".spz", ".spz.glb"] {
-            assert_eq!(notes(suffix, 8e6), Vec::<String>::new());
+            assert_eq!(notes(suffix, 4e3), Vec::<String>::new());
             assert!(
-                notes(suffix, -1e7)[0].starts_with("1 of 3 splats are farther"),
+                notes(suffix, -1e7)[0].starts_with("1 of 3 splats are farther from the origin than the 4096 units"),
                 "{suffix}"
             );
         }

@@ -4,14 +4,16 @@
 //!
 //! Files have the dataset's coordinates. If these are far from the origin, `x y z` are doubles, since at 500 km in millimetres
 //! neighbouring floats are centimetres apart; a comment then holds [`GaussianCloud::world_from_dataset`], with which reading returns to
-//! floats.
+//! floats. Doubles of other programs that are as far away get a world whose origin is their mean.
+//!
+//! Nerfstudio's export without harmonics has the colours `red green blue` in place of `f_dc_*`.
 
 use crate::ply::{Column, MAX_HEADER_BYTES, Ply, Rows, name_of};
 use crate::splats::compressed_ply;
 use crate::splats::rows::{SPLATS_PER_TASK, decode_splats};
 use crate::{FormatError, Malformed};
 use glam::DVec3;
-use irradia_scene::{ExtraColumn, GaussianCloud, Similarity, sh};
+use irradia_scene::{ExtraColumn, GaussianCloud, Scalar, Similarity, sh};
 use rayon::prelude::*;
 use std::fs::File;
 use std::io::{self, Read, Write};
@@ -27,6 +29,8 @@ const MAX_DEGREE: u32 = 4;
 /// The properties of a splat file that every splat needs.
 const POSITION_PROPERTIES: [&str; 3] = ["x", "y", "z"];
 const DC_PROPERTIES: [&str; 3] = ["f_dc_0", "f_dc_1", "f_dc_2"];
+/// Bytes of colour, if there are no harmonics at all.
+const COLOR_PROPERTIES: [&str; 3] = ["red", "green", "blue"];
 const SCALE_PROPERTIES: [&str; 3] = ["scale_0", "scale_1", "scale_2"];
 const ROTATION_PROPERTIES: [&str; 4] = ["rot_0", "rot_1", "rot_2", "rot_3"];
 
@@ -44,9 +48,21 @@ pub fn parse_splat_ply(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     let rows = ply.rows("vertex")?;
     let columns = Columns::find(&rows, sh_degree)?;
 
-    let world_from_dataset = parse_world(&ply)?;
+    let declared = parse_world(&ply)?;
+    let world = declared.or_else(|| world_of_doubles(&rows, &columns));
+    let mut cloud = decode(&rows, &columns, sh_degree, world.unwrap_or_default());
+    if declared.is_none() && world.is_some() && !super::exceeds_f32_precision(&cloud) {
+        cloud = decode(&rows, &columns, sh_degree, Similarity::IDENTITY);
+    }
+    cloud.antialiased = ply.comments.iter().any(|comment| comment.trim() == ANTIALIASED_COMMENT);
+    cloud.extra = extra_columns(&rows, &columns);
+    Ok(cloud)
+}
+
+/// The splats in the world of `world_from_dataset`.
+fn decode(rows: &Rows, columns: &Columns, sh_degree: u32, world_from_dataset: Similarity) -> GaussianCloud {
     let (has_world, log_scale) = (!world_from_dataset.is_identity(), world_from_dataset.scale.ln());
-    let mut cloud = decode_splats(rows.len(), sh_degree, |i, splat| {
+    let cloud = decode_splats(rows.len(), sh_degree, |i, splat| {
         let row = rows.row(i);
         *splat.mean = columns.position.map(|c| c.f32(row));
         *splat.quat = columns.rotation.map(|c| c.f32(row));
@@ -60,18 +76,34 @@ pub fn parse_splat_ply(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
         for (value, column) in splat.sh.iter_mut().zip(&columns.sh) {
             *value = column.f32(row);
         }
+        if columns.are_colors {
+            splat.sh.iter_mut().for_each(|v| *v = sh::dc_from_color(*v / 255.0));
+        }
     });
-    cloud.antialiased = ply.comments.iter().any(|comment| comment.trim() == ANTIALIASED_COMMENT);
-    cloud.world_from_dataset = world_from_dataset;
-    cloud.extra = extra_columns(&rows);
-    Ok(cloud)
+    GaussianCloud {
+        world_from_dataset,
+        ..cloud
+    }
+}
+
+/// A world whose origin is the mean of the positions, if they are doubles.
+fn world_of_doubles(rows: &Rows, columns: &Columns) -> Option<Similarity> {
+    let are_doubles = columns.position.iter().all(|column| column.scalar == Scalar::F64);
+    let positions = (0..rows.len()).map(|i| DVec3::from(columns.position.map(|column| column.f64(rows.row(i)))));
+    let finite = || positions.clone().filter(|position| position.is_finite());
+    let mean = finite().sum::<DVec3>() / finite().count() as f64;
+    (are_doubles && mean.is_finite()).then_some(Similarity {
+        scale: 1.0,
+        center: mean.round(),
+    })
 }
 
 /// Scalar properties of splats that are not ours; if a name occurs twice, the first.
-fn extra_columns(rows: &Rows) -> Vec<ExtraColumn> {
+fn extra_columns(rows: &Rows, columns: &Columns) -> Vec<ExtraColumn> {
     let mut found: Vec<(&str, Column)> = Vec::new();
     for (name, column) in rows.named_columns() {
-        if !is_known(name) && found.iter().all(|(other, _)| *other != name) {
+        let is_read = is_known(name) || columns.are_colors && COLOR_PROPERTIES.contains(&name);
+        if !is_read && found.iter().all(|(other, _)| *other != name) {
             found.push((name, column));
         }
     }
@@ -99,14 +131,14 @@ fn is_known(name: &str) -> bool {
     known.into_iter().flatten().any(|known| *known == name) || name.starts_with("f_rest_")
 }
 
-/// The world of the file's splats; the identity if the file does not give one.
-fn parse_world(ply: &Ply) -> Result<Similarity, Malformed> {
+/// The world of the file's splats, if the file gives one.
+fn parse_world(ply: &Ply) -> Result<Option<Similarity>, Malformed> {
     let Some(numbers) = ply
         .comments
         .iter()
         .find_map(|comment| comment.trim().strip_prefix(WORLD_COMMENT))
     else {
-        return Ok(Similarity::IDENTITY);
+        return Ok(None);
     };
     let numbers: Vec<f64> = numbers
         .split_whitespace()
@@ -120,7 +152,7 @@ fn parse_world(ply: &Ply) -> Result<Similarity, Malformed> {
         _ => Similarity::default(),
     };
     if numbers.len() == 4 && world.is_valid() {
-        return Ok(world);
+        return Ok(Some(world));
     }
     Err(Malformed(format!(
         "the comment {WORLD_COMMENT} does not hold a positive scale and three coordinates; remove it to read the file as it is"
@@ -152,7 +184,11 @@ pub(crate) fn has_splats(path: &Path) -> Result<bool, FormatError> {
         path: path.to_owned(),
         source,
     })?;
-    let is_of_splats = |name: &str| name.starts_with("f_dc_") || name.starts_with("packed_");
+    let is_of_splats = |name: &str| {
+        ["f_dc_", "packed_", "rot_"]
+            .iter()
+            .any(|prefix| name.starts_with(prefix))
+    };
     let found = Ply::parse(&header).and_then(|ply| Ok(ply.property_names("vertex")?.any(is_of_splats)));
     found.map_err(|source| FormatError::Malformed {
         path: path.to_owned(),
@@ -167,11 +203,16 @@ struct Columns {
     opacity: Column,
     /// In the order of [`GaussianCloud::sh`].
     sh: Vec<Column>,
+    /// Whether `sh` are colours from 0 to 255.
+    are_colors: bool,
 }
 
 impl Columns {
     fn find(rows: &Rows, sh_degree: u32) -> Result<Self, Malformed> {
-        let mut sh = rows.columns(DC_PROPERTIES)?.to_vec();
+        let are_colors = rows.columns([DC_PROPERTIES[0]]).is_err();
+        let mut sh = rows
+            .columns(if are_colors { COLOR_PROPERTIES } else { DC_PROPERTIES })?
+            .to_vec();
         let rest = sh::coefficients(sh_degree) - 1;
         for coefficient in 0..rest {
             for channel in 0..3 {
@@ -185,6 +226,7 @@ impl Columns {
             scale: rows.columns(SCALE_PROPERTIES)?,
             opacity: rows.columns(["opacity"])?[0],
             sh,
+            are_colors,
         })
     }
 }
@@ -192,15 +234,19 @@ impl Columns {
 /// Checks, before the body is read, that no property is missing, naming all that are; returns the SH degree.
 fn check_properties(ply: &Ply) -> Result<u32, Malformed> {
     let names: Vec<&str> = ply.property_names("vertex")?.collect();
+    let rest = names.iter().filter(|name| name.starts_with("f_rest_")).count();
+    let has = |name: &str| names.contains(&name);
+    let are_colors =
+        rest == 0 && !DC_PROPERTIES.iter().any(|name| has(name)) && COLOR_PROPERTIES.iter().all(|name| has(name));
     let needed = POSITION_PROPERTIES
         .iter()
-        .chain(&DC_PROPERTIES)
+        .chain(if are_colors { &COLOR_PROPERTIES } else { &DC_PROPERTIES })
         .chain(&["opacity"])
         .chain(&SCALE_PROPERTIES)
         .chain(&ROTATION_PROPERTIES);
-    let missing: Vec<&str> = needed.copied().filter(|name| !names.contains(name)).collect();
+    let missing: Vec<&str> = needed.copied().filter(|name| !has(name)).collect();
     if !missing.is_empty() {
-        let hint = if DC_PROPERTIES.iter().all(|name| missing.contains(name)) {
+        let hint = if ROTATION_PROPERTIES.iter().all(|name| missing.contains(name)) {
             "; it is a point cloud or a mesh, not a splat scene"
         } else {
             ""
@@ -210,7 +256,6 @@ fn check_properties(ply: &Ply) -> Result<u32, Malformed> {
             missing.join(", ")
         )));
     }
-    let rest = names.iter().filter(|name| name.starts_with("f_rest_")).count();
     (0..=MAX_DEGREE)
         .find(|degree| 3 * (sh::coefficients(*degree) - 1) == rest)
         .ok_or_else(|| {

@@ -5,6 +5,9 @@ use irradia_scene::sh;
 /// Opacities of 0 and 1 have no finite logit; other readers use the same bound.
 const MIN_OPACITY: f64 = 1e-6;
 
+/// Bounds of ln scale in formats whose steps depend on the bounds: a scale of 0 has no finite logarithm.
+pub(crate) const MAX_LOG_SCALE: f32 = 20.0;
+
 /// `1 / (1 + exp(-x))`.
 pub(crate) fn sigmoid(logit: f32) -> f32 {
     1.0 / (1.0 + (-logit).exp())

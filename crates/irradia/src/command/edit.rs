@@ -6,9 +6,9 @@ use crate::Usage;
 use crate::terminal::{note, print_line};
 use anyhow::{Context, Result};
 use irradia_edit::{Edit, EditList, Shape};
-use irradia_runs::formats::{WriteOptions, write_atomic};
+use irradia_runs::formats::{SplatFormat, WriteOptions, write_atomic};
 use irradia_runs::{AppliedEdit, Editing};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 #[derive(clap::Args)]
 #[command(after_long_help = OPERATIONS)]
@@ -37,7 +37,7 @@ pub struct Args {
     #[arg(long, conflicts_with_all = ["out", "preview"])]
     pub in_place: bool,
     /// How much a lossy format may lose, if it offers a choice (.spz, .sog, .ksplat)
-    #[arg(long, value_enum, default_value_t = QualityArg::Normal)]
+    #[arg(long, value_enum, default_value_t = QualityArg::Normal, conflicts_with_all = ["preview", "in_place"])]
     pub quality: QualityArg,
     /// Threads; all cores when absent
     #[arg(long, value_name = "N", value_parser = thread_count())]
@@ -91,6 +91,9 @@ pub fn run(args: &Args) -> Result<()> {
     editing.apply(&list)?;
     warn(&editing.notes[read..]);
     let mut notes = Vec::new();
+    if let Some(path) = &args.save_edits {
+        check_list(path, args, &editing)?;
+    }
     if let Some(out) = &args.out {
         let options = WriteOptions {
             quality: args.quality.into(),
@@ -117,6 +120,19 @@ pub fn run(args: &Args) -> Result<()> {
     let edits: String = editing.applied().iter().map(line).collect();
     let notes = note_lines(&notes);
     print_line(format_args!("{title}: {shown} splats{edits}{notes}"))
+}
+
+/// Rejects a list of edits that would replace a scene that is read or written.
+fn check_list(path: &Path, args: &Args, editing: &Editing) -> Result<()> {
+    editing.check_output(path)?;
+    if args.out.as_ref().is_some_and(|out| out == path) || SplatFormat::of(path).is_ok() {
+        return Err(Usage(format!(
+            "--save-edits {}: name a file that is not a scene's, such as edits.toml",
+            path.display()
+        ))
+        .into());
+    }
+    Ok(())
 }
 
 /// The summary line of an edit, with everything that was found automatically.

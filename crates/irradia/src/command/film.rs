@@ -57,8 +57,10 @@ enum Encoder {
     Gif {
         encoder: Box<gif::Encoder<BufWriter<File>>>,
         fps: f32,
-        /// Written so far.
+        /// Added so far.
         frames: u32,
+        /// Those written, in hundredths of a second.
+        written: u32,
     },
 }
 
@@ -79,6 +81,10 @@ impl FilmWriter {
                 path.display()
             ))
             .into());
+        }
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+        if let Some(folder) = folder {
+            fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
         }
         let unfinished = path.with_file_name(format!(".{name}.{}.tmp", std::process::id()));
         let encoder = match kind(path) {
@@ -104,12 +110,24 @@ impl FilmWriter {
                     .write_all(&rgb)
                     .or_else(|error| self.end().and(Err(error).context("ffmpeg accepts no more frames")))
             }
-            Encoder::Gif { encoder, fps, frames } => {
-                let mut frame = gif::Frame::from_rgb_speed(image.width as u16, image.height as u16, &rgb, GIF_SPEED);
-                // In whole hundredths of a second that add up to the film's length; browsers slow down frames of less than two.
-                let ends = |frames: u32| (100.0 * frames as f32 / *fps).round() as u32;
-                frame.delay = (ends(*frames + 1) - ends(*frames)).clamp(2, u16::MAX.into()) as u16;
+            Encoder::Gif {
+                encoder,
+                fps,
+                frames,
+                written,
+            } => {
                 *frames += 1;
+                // In whole hundredths of a second that add up to the film's length. Browsers slow down frames of less than two, so at
+                // more than 50 frames a second, some are left out.
+                let end = (100.0 * *frames as f32 / *fps).round() as u32;
+                let delay = end.saturating_sub(*written);
+                if delay < 2 && *frames > 1 {
+                    return Ok(());
+                }
+                let delay = delay.max(2);
+                *written += delay;
+                let mut frame = gif::Frame::from_rgb_speed(image.width as u16, image.height as u16, &rgb, GIF_SPEED);
+                frame.delay = delay.min(u16::MAX.into()) as u16;
                 encoder
                     .write_frame(&frame)
                     .with_context(|| format!("cannot write {}", self.path.display()))
@@ -163,6 +181,7 @@ fn gif_encoder(path: &Path, width: u32, height: u32, fps: f32) -> Result<Encoder
         encoder: Box::new(encoder),
         fps,
         frames: 0,
+        written: 0,
     })
 }
 

@@ -4,15 +4,18 @@ use super::depths::Depths;
 use super::film::{self, FilmWriter};
 use super::{DataArgs, Split, rendering_device, thread_count, use_threads, warn, with_option_names};
 use crate::Usage;
+use crate::interrupt::stop_flag;
 use crate::terminal::print_line;
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use irradia_edit::Transform;
 use irradia_runs::scene::{Camera, Image};
 use irradia_runs::train::painter::Painter;
 use irradia_runs::{
-    Film, ReadingOptions, Scene, camera_names, file_stems, is_film_name, moved_from_run, scene_path, write_image,
+    FRAME_SIDE, Film, ReadingOptions, Scene, camera_names, file_stems, is_film_name, moved_from_run, scene_path,
+    write_image,
 };
 use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering;
 
 #[derive(clap::Args)]
 #[command(group(clap::ArgGroup::new("cameras").required(true).args(["data", "orbit", "path"])))]
@@ -67,7 +70,7 @@ const PATH_FRAMES: u32 = 120;
 pub fn parse_size(text: &str) -> Result<(u32, u32), String> {
     text.split_once('x')
         .and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)))
-        .filter(|(w, h)| (1..=16384).contains(w) && (1..=16384).contains(h))
+        .filter(|(w, h)| FRAME_SIDE.contains(w) && FRAME_SIDE.contains(h))
         .ok_or_else(|| "expected a size such as 640x480, each side 1 to 16384".into())
 }
 
@@ -170,7 +173,7 @@ pub(super) fn film_from_path(
             let k = scene.orbit_geometry().intrinsics;
             let moved = moved_from_run(&scene_path(source));
             let world_from_photographs = moved.then(&Transform::to_world(&scene.world_from_dataset));
-            Film::read(path, &world_from_photographs, size.unwrap_or((k.width, k.height)))?
+            Film::read(path, &world_from_photographs, size, (k.width, k.height))?
         }
     })
 }
@@ -191,7 +194,11 @@ fn write_film(args: &Args, scene: &Scene, film: &Film) -> Result<()> {
     let fps = args.fps.map_or(film.fps, |fps| fps as f32);
     let mut writer = FilmWriter::begin(&args.out, (k.width, k.height), fps)?;
     let mut painter = painter(args, scene)?;
+    let stop = stop_flag();
     for camera in &film.cameras {
+        if stop.load(Ordering::Relaxed) {
+            bail!("interrupted: {} is not written", args.out.display());
+        }
         writer.add(&painter.render(camera, &scene.options)?.color)?;
     }
     writer.finish()?;

@@ -24,6 +24,16 @@ fn paths_become_frames_and_films() {
     let film = fs::read(folder.path().join("film.gif")).expect("a film");
     // Width and height, little endian, after the signature.
     assert_eq!((&film[..6], &film[6..10]), (&b"GIF89a"[..], &[41, 0, 30, 0][..]));
+    // At more than 50 frames a second, frames are left out, and the length is right; folders are created.
+    irradia(
+        folder.path(),
+        "render run --orbit 24 --size 8x6 --fps 100 --out new/fast.gif",
+    )
+    .success();
+    let film = fs::read(folder.path().join("new/fast.gif")).expect("a film");
+    // The delay of a frame follows the label of its control block.
+    let delays = film.windows(3).filter(|w| w[..3] == [0x21, 0xf9, 4]).count();
+    assert_eq!(delays, 12);
 }
 
 #[test]

@@ -83,6 +83,14 @@ fn a_folder_gets_the_scene_its_moved_cameras_and_the_edits() {
     let error = editing.write_in_place().expect_err("moved").to_string();
     assert!(error.contains("photographs"), "{error}");
 
+    // Neither is a folder with files of somebody else.
+    let foreign = folder.path().join("foreign");
+    fs::create_dir(&foreign).unwrap();
+    fs::write(foreign.join("cameras.json"), "[]").unwrap();
+    let error = editing.write(&foreign, &WriteOptions::default()).expect_err("refused");
+    assert!(error.to_string().contains("cameras.json would be replaced"), "{error}");
+    assert!(foreign.join("cameras.json").is_file() && !foreign.join("scene.ply").exists());
+
     // Another scene written to the same folder keeps no files of this one.
     edited(&again, &["opacity factor=0.9 all"])
         .write(&out, &WriteOptions::default())
@@ -123,6 +131,15 @@ fn what_is_split_off_and_merged_again_is_the_same_scene() {
         "split off before",
     );
     let merged = edited(&out, &[&format!("merge file={}", part.display())]);
+    // A merged scene is not replaced, however its path is spelled.
+    for name in ["part.ply", "missing/../part.ply"] {
+        let error = merged.write(&folder.path().join(name), &WriteOptions::default());
+        let error = error.expect_err("refused").to_string();
+        assert!(
+            error.contains("would be replaced") && !folder.path().join("missing").exists(),
+            "{error}"
+        );
+    }
     let whole = read_splats(&path.join("scene.ply")).unwrap();
     assert_eq!(merged.draft().len(), whole.len());
     let sorted = |cloud: &GaussianCloud| {

@@ -289,11 +289,12 @@ impl Session {
         }
         let mut draft = (*self.draft).clone();
         let notes = RefCell::new(Vec::new());
+        let cloud = &self.draft.cloud;
         let open = |file: &str| {
             let other = self.uploads.open(file)?;
             notes
                 .borrow_mut()
-                .extend(merge_notes(file, &other, self.draft.cloud.antialiased));
+                .extend(merge_notes(file, &other, cloud.antialiased, &cloud.extra));
             Ok(other.cloud)
         };
         // What is selected need not be searched for again, which may take a minute.

@@ -30,6 +30,8 @@ pub fn parse_glb(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
             bytes.len()
         )));
     }
+    // What follows the declared length is ignored.
+    let mut rest = ByteReader::new(&bytes[12.min(length)..length]);
     let (mut text, mut binary) = (None, None);
     while !rest.is_empty() {
         let (length, kind) = (rest.u32()?, rest.u32()?);

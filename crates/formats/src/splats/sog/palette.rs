@@ -10,6 +10,8 @@ use std::collections::hash_map::Entry;
 const BINS: usize = 1 << 16;
 /// Bins by which their density is estimated: few, so that each holds many numbers.
 const DENSITY_BINS: usize = 512;
+/// Numbers farther than this many inner ranges from the inner range are outliers.
+const OUTLIER_RANGES: f32 = 4.0;
 /// Rounds of Lloyd's method; later ones change little.
 const CODEBOOK_ROUNDS: usize = 30;
 const COARSE_ROUNDS: usize = 10;
@@ -33,15 +35,26 @@ impl Codebook {
         if let Some(exact) = Self::exact(finite(), count) {
             return exact;
         }
-        let scale = (BINS - 1) as f64 / (f64::from(high) - f64::from(low));
+        let [low, high] = inner_range(values, [low, high]).map(f64::from);
+        let scale = (BINS - 1) as f64 / (high - low);
         let mut bins = vec![(0u64, 0f64); BINS];
-        for v in finite() {
-            let bin = &mut bins[((f64::from(v) - f64::from(low)) * scale) as usize];
+        // Outliers, of which there are few, have bins of their own.
+        let mut outliers = Vec::new();
+        for v in finite().map(f64::from) {
+            if v < low || v > high {
+                outliers.push((1, v));
+                continue;
+            }
+            let bin = &mut bins[((v - low) * scale) as usize];
             bin.0 += 1;
-            bin.1 += f64::from(v);
+            bin.1 += v;
         }
         bins.retain(|(count, _)| *count > 0);
-        let mut numbers = Self::initial_numbers(&bins, low.into(), high.into(), count);
+        let mut numbers = Self::initial_numbers(&bins, low, high, count);
+        if !outliers.is_empty() {
+            bins.append(&mut outliers);
+            bins.sort_unstable_by(|a, b| (a.1 / a.0 as f64).total_cmp(&(b.1 / b.0 as f64)));
+        }
         for _ in 0..CODEBOOK_ROUNDS {
             let mut sums = [(0u64, 0f64); 256];
             let mut nearest = 0;
@@ -116,6 +129,25 @@ impl Codebook {
         let above = self.0.partition_point(|number| *number < value).clamp(1, 255);
         let nearer_below = value - self.0[above - 1] <= self.0[above] - value;
         (above - usize::from(nearer_below)) as u8
+    }
+}
+
+/// The range of the finite `values`, within [`OUTLIER_RANGES`] ranges of all but a thousandth of them at each end: a single outlier would
+/// make the bins of all others coarse. At least one value counts as the end's thousandth. `all` is the whole range.
+fn inner_range(values: &[f32], all: [f32; 2]) -> [f32; 2] {
+    let step = values.len().div_ceil(MAX_SAMPLES);
+    let mut sample: Vec<f32> = values.iter().step_by(step).copied().filter(|v| v.is_finite()).collect();
+    sample.sort_unstable_by(f32::total_cmp);
+    let cut = (sample.len() / 1000).max(1);
+    if sample.len() <= 2 * cut {
+        return all;
+    }
+    let [low, high] = [sample[cut], sample[sample.len() - 1 - cut]];
+    let margin = OUTLIER_RANGES * (high - low);
+    if margin > 0.0 {
+        [(low - margin).max(all[0]), (high + margin).min(all[1])]
+    } else {
+        all
     }
 }
 
@@ -393,6 +425,22 @@ mod tests {
         let near: Vec<f32> = (0..200).map(|i| 1.0 + i as f32 * 1e-6).chain([1000.0]).collect();
         let codebook = Codebook::of(&near, 256);
         assert!(near.iter().all(|v| codebook.0[usize::from(codebook.index(*v))] == *v));
+        // An outlier does not cost the others their precision.
+        let error = |values: &[f32]| {
+            let codebook = Codebook::of(values, 256);
+            let errors = values[..10_000]
+                .iter()
+                .map(|v| (codebook.0[usize::from(codebook.index(*v))] - v).abs());
+            errors.sum::<f32>() / 10_000.0
+        };
+        let mut values: Vec<f32> = (0..10_000).map(|_| rng.range(-1.0, 1.0)).collect();
+        let alone = error(&values);
+        values.extend([1e5, -3e7]);
+        assert!(
+            alone < 0.003 && error(&values) < 1.1 * alone,
+            "{alone}, {}",
+            error(&values)
+        );
         assert_eq!(
             Codebook::of(&[-1.0, 0.01, 2.0], 256).with_zero().0[..3],
             [-1.0, 0.0, 2.0]

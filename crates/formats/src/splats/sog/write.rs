@@ -1,6 +1,6 @@
 use super::palette::{Codebook, Palette};
 use super::{ENTRIES_PER_ROW, LARGEST_W, META_FILE};
-use crate::splats::quantize::{opacity_byte, smallest_three};
+use crate::splats::quantize::{MAX_LOG_SCALE, opacity_byte, smallest_three};
 use crate::splats::rows::{bounds, encode_rows, morton_order};
 use crate::splats::{SogDetail, WriteOptions};
 use crate::zip::Writer;
@@ -53,7 +53,12 @@ pub(crate) fn encode(cloud: &GaussianCloud, options: &WriteOptions) -> io::Resul
         let t = (f64::from(logarithm(cloud.means[i][c])) - f64::from(low[c])) / extent.max(f64::MIN_POSITIVE);
         (round_to_multiple(t * 65535.0, 16 - position_bits, 65535) as u16).to_le_bytes()
     };
-    let scales = Codebook::of(cloud.log_scales.as_flattened(), detail.codebook.clamp(2, 256));
+    let log_scales: Vec<[f32; 3]> = cloud
+        .log_scales
+        .iter()
+        .map(|scales| scales.map(|scale| scale.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE)))
+        .collect();
+    let scales = Codebook::of(log_scales.as_flattened(), detail.codebook.clamp(2, 256));
     let colors: Vec<f32> = cloud
         .sh
         .chunks_exact(width)
@@ -69,7 +74,7 @@ pub(crate) fn encode(cloud: &GaussianCloud, options: &WriteOptions) -> io::Resul
             (0..3).for_each(|c| pixel[c] = position_bytes(i, c)[1])
         }),
         image("scales.webp", 3, &|i, pixel| {
-            (0..3).for_each(|c| pixel[c] = scales.index(cloud.log_scales[i][c]))
+            (0..3).for_each(|c| pixel[c] = scales.index(log_scales[i][c]))
         }),
         image("quats.webp", 4, &|i, pixel| {
             let (largest, others) = smallest_three(cloud.quats[i]);

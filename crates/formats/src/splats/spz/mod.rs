@@ -9,7 +9,7 @@ mod read;
 mod write;
 
 pub use read::parse;
-pub(crate) use write::{encode, write};
+pub(crate) use write::{encode, max_coordinate, write};
 
 const MAGIC: &[u8; 4] = b"NGSP";
 /// Bit of the flags for scenes trained with the Mip-Splatting filters.
@@ -17,7 +17,7 @@ const ANTIALIASED_FLAG: u8 = 1;
 /// Bit of the flags for extensions, which lie between header and table (version 4) or at the end.
 const EXTENSIONS_FLAG: u8 = 2;
 /// The largest coordinate of a position: 24 bits with a sign, none of them for a fraction.
-pub(crate) const MAX_COORDINATE: f32 = 8_388_607.0;
+const MAX_COORDINATE: f32 = 8_388_607.0;
 /// A step of colour is `1 / (255 COLOR_SCALE)` of a DC coefficient.
 const COLOR_SCALE: f32 = 0.15;
 /// ln scales are stored as `(ln scale + 10) 16`.

@@ -23,12 +23,8 @@ pub fn parse(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
         let count = plausible_count(header.count.into(), bytes.len())?;
         let widths = header.widths();
         let arrays = stream.take(count * widths.iter().sum::<usize>())?;
-        stream.finish()?;
-        return Ok(decode(
-            &header,
-            split_arrays(&arrays, count, widths),
-            Signs::HALF_TURN_X,
-        ));
+        let signs = signs_after_arrays(&header, &stream.finish()?)?;
+        return Ok(decode(&header, split_arrays(&arrays, count, widths), signs));
     }
     let Some([a, b, c, d]) = bytes.strip_prefix(MAGIC).and_then(|rest| rest.first_chunk::<4>()) else {
         return Err(Malformed(
@@ -43,7 +39,16 @@ pub fn parse(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     let count = plausible_count(header.count.into(), bytes.len())?;
     let widths = header.widths();
     let arrays = rest.take(count * widths.iter().sum::<usize>())?;
-    Ok(decode(&header, split_arrays(arrays, count, widths), Signs::HALF_TURN_X))
+    let signs = signs_after_arrays(&header, &bytes[16 + arrays.len()..])?;
+    Ok(decode(&header, split_arrays(arrays, count, widths), signs))
+}
+
+/// The axes that extensions behind the arrays declare; without its flag, what follows the arrays is ignored.
+fn signs_after_arrays(header: &Header, rest: &[u8]) -> Result<Signs, Malformed> {
+    match header.flags & EXTENSIONS_FLAG {
+        0 => Ok(Signs::HALF_TURN_X),
+        _ => signs_of_extensions(rest),
+    }
 }
 
 /// The fields that every version has, in this order.

@@ -64,12 +64,29 @@ pub(crate) fn encode(cloud: &GaussianCloud, quality: Quality, version: SpzVersio
     gzip(&bytes)
 }
 
+/// The largest coordinate of a position in a file of `means`.
+pub(crate) fn max_coordinate(means: &[[f32; 3]], quality: Quality) -> f32 {
+    MAX_COORDINATE * (-f32::from(fraction_bits(means, quality))).exp2()
+}
+
 /// Fractional bits of positions: the format's own 12; more at normal quality as long as the farthest coordinate has at most 16 bits in
-/// total, and up to 20 at high quality. Finer steps are noise, which does not compress. Never more than 23 bits in total, so that the
-/// farthest coordinate fits.
+/// total, and up to 20 at high quality. Finer steps are noise, which does not compress. Not more than 23 bits in total, so that the
+/// farthest coordinate fits, unless it is so far that the others would have fewer than 12 bits: a lost splat ruins no scene.
 fn fraction_bits(means: &[[f32; 3]], quality: Quality) -> u8 {
-    let max_coordinate = means.as_flattened().iter().fold(0f32, |max, v| max.max(v.abs()));
-    let integer_bits = max_coordinate.max(f32::MIN_POSITIVE).log2().floor() as i32 + 1;
+    let bits_of = |coordinate: f32| coordinate.max(f32::MIN_POSITIVE).log2().floor() as i32 + 1;
+    let mut extents: Vec<f32> = means
+        .iter()
+        .map(|mean| mean.iter().fold(0f32, |max, v| max.max(v.abs())))
+        .collect();
+    extents.push(0.0);
+    let rank = (extents.len() - 1) * 99 / 100;
+    let (_, most, farther) = extents.select_nth_unstable_by(rank, f32::total_cmp);
+    let most = *most;
+    let farthest = farther.iter().copied().fold(most, f32::max);
+    let integer_bits = match most {
+        0.0 => bits_of(farthest),
+        _ => bits_of(farthest).min(bits_of(most) + 11),
+    };
     let wanted = match quality {
         Quality::Low => DEFAULT_FRACTION_BITS,
         Quality::Normal => (16 - integer_bits).max(DEFAULT_FRACTION_BITS),
@@ -173,10 +190,22 @@ mod tests {
             (2048.1, 11, 11, 11),
             (1e9, 0, 0, 0),
         ] {
-            let bits =
-                [Quality::Low, Quality::Normal, Quality::High].map(|q| fraction_bits(&[[0.5, -farthest, 0.0]], q));
+            // Most of the splats are that far.
+            let means = [[0.5, -farthest, 0.0]; 100];
+            let bits = [Quality::Low, Quality::Normal, Quality::High].map(|q| fraction_bits(&means, q));
             assert_eq!(bits, [low, normal, high], "{farthest}");
         }
+        // A splat far from all others does not cost them their precision.
+        let mut means = vec![[1.5, -1.0, 0.0]; 200];
+        means[7][2] = 1e6;
+        assert_eq!(fraction_bits(&means, Quality::High), 11);
+        assert_eq!(
+            (
+                fraction_bits(&[], Quality::Low),
+                fraction_bits(&[[0.0; 3]], Quality::Low)
+            ),
+            (12, 12)
+        );
     }
 
     #[test]

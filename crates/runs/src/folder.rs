@@ -75,6 +75,19 @@ fn all_files() -> impl Iterator<Item = &'static str> {
 /// The subfolders of a run.
 const SUBFOLDERS: [&str; 2] = ["eval", "checkpoints"];
 
+/// What the names of a run's files in its subfolders end with.
+const SUFFIXES: [&str; 4] = [".truth.png", ".render.png", ".error.png", ".safetensors"];
+
+/// The files of a run in one of its subfolders; others in it are somebody else's.
+fn files_in_subfolder(folder: &Path) -> Vec<PathBuf> {
+    let entries = fs::read_dir(folder).into_iter().flatten().flatten();
+    let is_ours = |file: &PathBuf| {
+        let name = file.file_name().unwrap_or_default().to_string_lossy();
+        SUFFIXES.iter().any(|suffix| name.ends_with(suffix))
+    };
+    entries.map(|entry| entry.path()).filter(is_ours).collect()
+}
+
 /// Files written before `run.json`; a run has begun once `run.json` exists.
 const FILES_BEFORE_RECORD: [&str; 5] = ["recipe.toml", CAMERAS, VIEWS, WORLD, REPEATED_PACES];
 
@@ -97,6 +110,9 @@ pub struct RunRecord {
     pub input: TrainInput,
     /// Whether the recipe was followed to its end and everything was written.
     pub complete: bool,
+    /// Warnings about the dataset: what was found when it was read, and whether its poses were replaced.
+    #[serde(default)]
+    pub data_warnings: Vec<String>,
 }
 
 impl RunRecord {
@@ -179,12 +195,10 @@ impl RunFolder {
         };
         Self::check_replaceable(path, overwrite)?;
         if all_files().any(|file| path.join(file).exists()) {
-            for folder in SUBFOLDERS.map(|folder| path.join(folder)) {
-                if folder.exists() {
-                    fs::remove_dir_all(&folder).map_err(RunError::io("clear", &folder))?;
-                }
-            }
-            for file in all_files().map(|file| path.join(file)) {
+            let in_subfolders = SUBFOLDERS
+                .iter()
+                .flat_map(|folder| files_in_subfolder(&path.join(folder)));
+            for file in in_subfolders.chain(all_files().map(|file| path.join(file))) {
                 if file.exists() {
                     fs::remove_file(&file).map_err(RunError::io("clear", &file))?;
                 }
@@ -252,13 +266,17 @@ impl RunFolder {
     }
 
     /// `run.json` of the run that contains the scene `path`, a file or a run's folder; `None` if there is none.
-    pub fn record_containing(path: &Path) -> Option<RunRecord> {
-        Some(Self::open(Self::containing(path)?.path()).ok()?.1)
+    ///
+    /// # Errors
+    /// When it cannot be read or is damaged.
+    pub fn record_containing(path: &Path) -> Result<Option<RunRecord>, RunError> {
+        let folder = Self::containing(path);
+        folder.map(|folder| Ok(Self::open(folder.path())?.1)).transpose()
     }
 
     /// The dataset of the run that contains the scene `path`, if its photographs were posed for it.
     pub fn posed_dataset(path: &Path) -> Option<PathBuf> {
-        let data = Self::record_containing(path)?.input.data;
+        let data = Self::record_containing(path).ok()??.input.data;
         same_file(&data, &Self::containing(path)?.file(POSED_FOLDER)).then_some(data)
     }
 
@@ -361,6 +379,15 @@ impl RunFolder {
     pub fn write(&self, name: &str, bytes: &[u8]) -> Result<(), RunError> {
         write_atomic(&self.file(name), |out| out.write_all(bytes))?;
         Ok(())
+    }
+
+    /// Removes the file `name`, if it exists.
+    pub(crate) fn remove(&self, name: &str) -> Result<(), RunError> {
+        let path = self.file(name);
+        match fs::remove_file(&path) {
+            Err(error) if error.kind() != ErrorKind::NotFound => Err(RunError::io("remove", &path)(error)),
+            _ => Ok(()),
+        }
     }
 
     /// Writes `run.json`. A dataset in the folder itself is recorded relative to it, since the run may be moved.

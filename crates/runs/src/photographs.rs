@@ -22,7 +22,7 @@ pub fn photographs_of(scene: &Path) -> Option<Photographs> {
 }
 
 fn read(scene: &Path) -> Option<LoadedPhotographs> {
-    let input = RunFolder::record_containing(scene)?.input;
+    let input = RunFolder::record_containing(scene).ok()??.input;
     let dataset = input.reading.read(&input.data).ok()?;
     // The scene's cameras are pinholes: photographs with distortion or a rolling shutter do not match them.
     if dataset.views.iter().any(|view| !view.camera.is_pinhole()) {

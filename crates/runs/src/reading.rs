@@ -178,7 +178,7 @@ impl ReadingOptions {
     /// Those of [`Reading::read`]; when the run's list of views is damaged, or its dataset has other poses by now.
     pub fn read_for(&self, scene: &Scene, path: &Path, data: &Path) -> Result<Dataset, RunError> {
         let (mut reading, mut is_own) = (Reading::default(), false);
-        if let Some(record) = RunFolder::record_containing(path) {
+        if let Some(record) = RunFolder::record_containing(path)? {
             reading = record.input.reading;
             is_own = same_file(data, &record.input.data);
             if !is_own {

@@ -37,10 +37,14 @@ impl Run {
                     folder.write(&name, &bytes)?;
                 }
                 folder.write_cameras(&self.trainer)?;
+                // Of an earlier stage of the recipe.
+                folder.remove(FIELD)
             }
-            Model::Field(field) => folder.write(FIELD, &field_file::to_bytes(&field))?,
+            Model::Field(field) => {
+                folder.write(FIELD, &field_file::to_bytes(&field))?;
+                folder.remove(SCENE)
+            }
         }
-        Ok(())
     }
 
     /// Evaluates the held-out views, writes their images, and creates the report.
@@ -86,6 +90,10 @@ impl Run {
         if trainer.dataset.test.is_empty() && !warnings.iter().any(is_explained) {
             warnings.push(format!("{NOTHING_HELD_OUT}: nothing was evaluated"));
         }
+        let beside = OutsideLoop {
+            preparing: self.preparing.unwrap_or(0.0),
+            finishing: finishing.elapsed().as_secs_f64(),
+        };
         Ok(Report {
             version: env!("CARGO_PKG_VERSION").to_owned(),
             device: device(trainer),
@@ -99,13 +107,11 @@ impl Run {
             training_seconds: trainer.seconds,
             breakdown: Breakdown {
                 inside: InsideLoop::of(&trainer.times, trainer.seconds),
-                beside: OutsideLoop {
-                    preparing: self.preparing.unwrap_or(0.0),
-                    finishing: finishing.elapsed().as_secs_f64(),
-                },
+                beside,
             },
             cpu_seconds: trainer.cpu_seconds,
-            total_seconds: self.request.started.elapsed().as_secs_f64(),
+            // Of all processes of a resumed run, as the seconds are.
+            total_seconds: beside.preparing + trainer.times.wall + beside.finishing,
             splats: trainer.engine.len() as u64,
             parameters: trainer.parameters().map(|n| n as u64),
             peak_rss_bytes: peak_rss_bytes(),

@@ -5,6 +5,7 @@ use crate::folder::{REPEATED_PACES, RunRecord};
 use crate::journal::Journal;
 use crate::lock::FolderLock;
 use crate::provenance::ViewList;
+use crate::scene_file::same_file;
 use crate::snapshot::{SnapshotServer, Snapshots};
 use crate::{RunError, RunFolder, SCENE, TrainRequest, background, moved_from_dataset};
 use irradia_compute::{Device, DeviceChoice};
@@ -49,6 +50,8 @@ pub struct Run {
     paces: Option<Paces>,
     /// Seconds between the request and the first step.
     pub(crate) preparing: Option<f64>,
+    /// Warnings about the dataset, also those of earlier processes.
+    data_warnings: Vec<String>,
     _lock: FolderLock,
 }
 
@@ -94,6 +97,19 @@ impl Run {
         request.choose_length(&dataset);
         let (out, overwrite) = (&request.input.out, request.input.overwrite);
         RunFolder::check_replaceable(out, overwrite)?;
+        if let Some(from) = &request.input.from
+            && let Some(run) = RunFolder::containing(from)
+            && same_file(run.path(), out)
+        {
+            return Err(RunError::Refused(format!(
+                "{} would be removed before the new run has a checkpoint: choose another --out",
+                from.display()
+            )));
+        }
+        if let Some(repeated) = &request.input.replay {
+            let folder = RunFolder::at(repeated);
+            check_same_data(&folder, folder.changed_views(&views)?, &request, &dataset)?;
+        }
         let existing_lock = FolderLock::acquire_existing(out)?;
         let paces = request.paces()?;
         let options = train_options(&request)?;
@@ -116,11 +132,13 @@ impl Run {
             folder.write(REPEATED_PACES, paces.to_text().as_bytes())?;
         }
         // Last: a folder with this file has everything needed to resume.
+        let data_warnings = trainer.dataset.warnings.clone();
         folder.write_record(RunRecord {
             input: request.input.clone(),
             complete: false,
+            data_warnings: data_warnings.clone(),
         })?;
-        Self::new(folder, lock, request, trainer, paces)
+        Self::new(folder, lock, request, trainer, paces, data_warnings)
     }
 
     /// Resumes the run in the request's folder from its latest checkpoint. The request comes from
@@ -141,7 +159,8 @@ impl Run {
     pub fn resume_on(request: TrainRequest, mut dataset: Dataset) -> Result<Self, RunError> {
         let (folder, record) = RunFolder::open(&request.input.out)?;
         let holdout = &request.input.reading.holdout;
-        if holdout.is_none() {
+        // A list, or the photographs of which every N-th is held out, may have changed since.
+        if holdout.is_none() || *holdout == record.input.reading.holdout {
             folder.restore_holdout(&mut dataset)?;
         }
         let views = ViewList::of(&dataset);
@@ -159,7 +178,7 @@ impl Run {
         let dataset = Arc::new(dataset);
         let trainer = match folder.newest_checkpoint()? {
             Some(path) => {
-                let mut differences = folder.changed_views(&views)?;
+                let differences = folder.changed_views(&views)?;
                 if let Some(requested) = holdout
                     && *holdout != record.input.reading.holdout
                     && !differences.is_empty()
@@ -170,16 +189,7 @@ impl Run {
                     );
                     return Err(RunError::setting("holdout", requested, message));
                 }
-                if moved_from_dataset(&folder.file(SCENE), &dataset).is_none() {
-                    differences.push("its views have other poses".to_owned());
-                }
-                if !differences.is_empty() {
-                    return Err(RunError::DataChanged {
-                        folder: folder.path().to_owned(),
-                        data: request.input.data.clone(),
-                        differences: differences.join("; "),
-                    });
-                }
+                check_same_data(&folder, differences, &request, &dataset)?;
                 read_checkpoint(&path, dataset, options)?
             }
             // Interrupted before its first checkpoint: no step depends on the earlier data.
@@ -198,11 +208,21 @@ impl Run {
         }
         folder.write_views(&views)?;
         // With what was changed to resume, should this process die.
+        // Reading the dataset again repeats some of its warnings, but not what was found out about its poses.
+        let mut data_warnings = record.data_warnings;
+        let now = &trainer.dataset.warnings;
+        data_warnings.extend(
+            now.iter()
+                .filter(|line| !data_warnings.contains(line))
+                .cloned()
+                .collect::<Vec<_>>(),
+        );
         folder.write_record(RunRecord {
             input: request.input.clone(),
             complete: record.complete,
+            data_warnings: data_warnings.clone(),
         })?;
-        Self::new(folder, lock, request, trainer, paces)
+        Self::new(folder, lock, request, trainer, paces, data_warnings)
     }
 
     fn new(
@@ -211,10 +231,11 @@ impl Run {
         request: TrainRequest,
         trainer: Trainer,
         paces: Option<Paces>,
+        data_warnings: Vec<String>,
     ) -> Result<Self, RunError> {
         let unseen_lpips = request.input.unseen_lpips.as_ref().map(Lpips::load).transpose()?;
         let mut journal = Journal::open(&folder, trainer.clock.step)?;
-        journal.warnings.extend(trainer.dataset.warnings.iter().cloned());
+        journal.warnings.extend(data_warnings.iter().cloned());
         journal.warnings.extend(request.warnings());
         Ok(Self {
             unseen_lpips,
@@ -225,6 +246,7 @@ impl Run {
             snapshots: SnapshotServer::new(),
             paces,
             preparing: None,
+            data_warnings,
             _lock: lock,
         })
     }
@@ -316,6 +338,7 @@ impl Run {
         self.folder.write_record(RunRecord {
             input: self.request.input,
             complete,
+            data_warnings: self.data_warnings,
         })?;
         Ok(Finished {
             folder: self.folder,
@@ -352,6 +375,38 @@ fn new_trainer(request: &TrainRequest, dataset: Arc<Dataset>, options: TrainOpti
 pub fn open_device(name: &str) -> Result<Device, RunError> {
     let Ok(choice) = name.parse::<DeviceChoice>();
     Device::open(&choice).map_err(|error| RunError::setting("device", name, error.to_string()))
+}
+
+/// Rejects a dataset with `differences` from that of the run in `folder`, or with other poses.
+fn check_same_data(
+    folder: &RunFolder,
+    mut differences: Vec<String>,
+    request: &TrainRequest,
+    dataset: &Dataset,
+) -> Result<(), RunError> {
+    if moved_from_dataset(&folder.file(SCENE), dataset).is_none() {
+        differences.push("its views have other poses".to_owned());
+    }
+    if differences.is_empty() {
+        return Ok(());
+    }
+    Err(RunError::DataChanged {
+        folder: folder.path().to_owned(),
+        data: request.input.data.clone(),
+        differences: differences.join("; "),
+    })
+}
+
+impl TrainRequest {
+    /// Opens the device and reads the LPIPS networks, so that mistakes are reported before photographs are posed.
+    ///
+    /// # Errors
+    /// When one of them cannot be used.
+    pub fn check_resources(&self) -> Result<(), RunError> {
+        train_options(self)?;
+        self.input.unseen_lpips.as_ref().map(Lpips::load).transpose()?;
+        Ok(())
+    }
 }
 
 /// The trainer's options from the request; reads the LPIPS network and opens the device.

@@ -37,6 +37,7 @@ const FIELD_PREFIX: &str = "field.";
 const TIMES_TENSOR: &str = "times";
 /// Recipe steps skipped before the first step; absent if none were.
 const SKIPPED_TENSOR: &str = "skipped";
+const INITIAL_SPLATS_TENSOR: &str = "initial_splats";
 /// Views to train on; absent if no misfits were left out.
 const TRAINED_TENSOR: &str = "trained_views";
 /// View and block of each block that is hidden as transient.
@@ -90,6 +91,10 @@ impl<'a> Checkpoint<'a> {
         others.push(NamedTensor::u64s("clock.whole", &integers));
         others.push(NamedTensor::f64s("clock.real", &reals));
         others.push(NamedTensor::f64s(TIMES_TENSOR, &trainer.times.to_array()));
+        others.push(NamedTensor::u64s(
+            INITIAL_SPLATS_TENSOR,
+            &[trainer.initial_splats as u64],
+        ));
         if trainer.skipped > 0.0 {
             others.push(NamedTensor::f64s(SKIPPED_TENSOR, &[trainer.skipped]));
         }
@@ -321,7 +326,11 @@ pub fn from_bytes(bytes: &[u8], dataset: Arc<Dataset>, options: TrainOptions) ->
     let state = read_state(tensors).map_err(damaged)?;
     let progress = read_progress(&file)?;
     let mut trainer = Trainer::with_empty_state(dataset, recipe, TrainOptions { seed, ..options }, state.len())?;
-    trainer.initial_splats = first_count(&trainer.dataset, &trainer.recipe).min(state.len());
+    // Not in the checkpoints of earlier versions.
+    trainer.initial_splats = match tensors.required_u64s(INITIAL_SPLATS_TENSOR).as_deref() {
+        Ok([initial]) => *initial as usize,
+        _ => first_count(&trainer.dataset, &trainer.recipe).min(state.len()),
+    };
     *trainer.engine.state_mut() = state;
     restore_field(&mut trainer, &file)?;
     restore_occupants(&mut trainer, &file)?;

@@ -90,6 +90,9 @@ pub fn run(
     if trainer.clock.step == 0 {
         skip_beginning(trainer, limits)?;
     }
+    if let Some(pace) = limits.paces.as_ref().and_then(|paces| paces.at(trainer.clock.step + 1)) {
+        trainer.pace = pace;
+    }
     let mut events = begin_events(trainer);
     let mut forecast = Forecast::default();
     let mut requests = notify(trainer, &mut events, observers);

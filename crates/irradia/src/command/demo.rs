@@ -3,11 +3,12 @@
 use super::lpips::{lpips_path, unseen_lpips_path};
 use super::render::parse_size;
 use super::{thread_count, train, use_threads};
+use crate::Usage;
 use crate::terminal::{note, print_line};
 use anyhow::Result;
 use irradia_runs::synth::{SceneName, SynthLens, SynthOptions};
-use irradia_runs::{TrainInput, write_synth_dataset};
-use std::path::PathBuf;
+use irradia_runs::{RunFolder, TrainInput, write_synth_dataset};
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 #[derive(clap::Args)]
@@ -56,6 +57,7 @@ pub struct SynthArgs {
 pub fn run(args: &Args) -> Result<()> {
     use_threads(args.threads)?;
     let (data, out) = (args.out.join("data"), args.out.join("run"));
+    check_replaceable(&data, &out)?;
     let start = Instant::now();
     note("ray tracing the demo scene ..");
     let options = SynthOptions {
@@ -84,6 +86,28 @@ pub fn run(args: &Args) -> Result<()> {
         out.join("scene.ply").display(),
         out.display()
     ))
+}
+
+/// Rejects data and a run that no earlier demo wrote.
+fn check_replaceable(data: &Path, run: &Path) -> Result<()> {
+    let is_empty = data.read_dir().map_or(true, |mut entries| entries.next().is_none());
+    let is_traced = ["transforms_train.json", "points.ply", "normal"]
+        .iter()
+        .all(|name| data.join(name).exists());
+    let record = RunFolder::record_containing(run)?;
+    let is_own = |trained_on: PathBuf| trained_on.canonicalize().ok() == data.canonicalize().ok();
+    let foreign = if !is_empty && !is_traced {
+        data
+    } else if record.is_some_and(|record| !is_own(record.input.data)) {
+        run
+    } else {
+        return Ok(());
+    };
+    let foreign = foreign.display();
+    Err(Usage(format!(
+        "{foreign} exists and was not written by a demo: choose another --out"
+    ))
+    .into())
 }
 
 pub fn synth(args: &SynthArgs) -> Result<()> {

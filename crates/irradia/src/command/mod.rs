@@ -125,7 +125,7 @@ pub fn data_for(given: Option<&Path>, scene: &Path) -> Result<PathBuf> {
     }
     // A scene that is not there is in no run either.
     std::fs::metadata(scene).with_context(|| format!("cannot read {}", scene.display()))?;
-    let of_run = RunFolder::record_containing(scene).map(|record| record.input.data);
+    let of_run = RunFolder::record_containing(scene)?.map(|record| record.input.data);
     of_run.ok_or_else(|| {
         let scene = scene.display();
         Usage(format!(

@@ -121,19 +121,21 @@ pub fn pose_first(input: &mut TrainInput, poses: Poses, anyway: bool) -> Result<
             "warning: {dataset} is a dataset with poses: name it instead to use them"
         ));
     }
-    pose_all(input, None, poses, anyway)?;
+    let photos = input.reading.images.clone().unwrap_or_else(|| input.data.clone());
+    pose_all(input, &photos, None, poses, anyway)?;
     Ok(())
 }
 
-/// Poses the photographs of `input`, or `only` some, into the folder `posed` of its run, and makes that its dataset. Fails if too few can be
-/// posed, unless `anyway`.
+/// Poses the capture `photos`, or `only` some of its photographs, into the folder `posed` of the run of `input`, and makes that its dataset.
+/// Fails if too few can be posed, unless `anyway`.
 pub fn pose_all(
     input: &mut TrainInput,
+    photos: &Path,
     only: Option<HashSet<PathBuf>>,
     poses: Poses,
     anyway: bool,
 ) -> Result<PoseReport> {
-    let report = pose_into_run(input, poses, only)?;
+    let report = pose_into_run(input, photos, poses, only)?;
     let posed = &input.data;
     if report.fraction() < MIN_POSED_FRACTION && !anyway {
         let reasons: Vec<&str> = report
@@ -181,7 +183,8 @@ pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses, anywa
         ))
         .into());
     }
-    let report = pose_into_run(input, poses, files_of(dataset, &photo_folder(input)))?;
+    let photos = photo_folder(input);
+    let report = pose_into_run(input, &photos, poses, files_of(dataset, &photos))?;
     let left_out: HashSet<&str> = report.left_out.iter().map(|left| bare_name(&left.name)).collect();
     let is_lost = |name: &&String| left_out.contains(name.as_str());
     let held_out: Vec<&str> = test.iter().filter(|name| !is_lost(name)).map(String::as_str).collect();
@@ -208,8 +211,11 @@ pub fn pose_again(input: &mut TrainInput, dataset: &Dataset, poses: Poses, anywa
 pub fn photo_folder(input: &TrainInput) -> PathBuf {
     match &input.reading.images {
         Some(images) => images.clone(),
-        // A file that describes the dataset.
-        None if input.data.is_file() => input.data.parent().unwrap_or(&input.data).to_owned(),
+        // A file that describes the dataset; the folder of a bare name is the current one.
+        None if input.data.is_file() => match input.data.parent() {
+            Some(folder) if !folder.as_os_str().is_empty() => folder.to_owned(),
+            _ => PathBuf::from("."),
+        },
         None => input.data.clone(),
     }
 }
@@ -249,11 +255,15 @@ fn bare_name(name: &str) -> &str {
     last.rsplit_once('.').map_or(last, |(bare, _)| bare)
 }
 
-/// Poses the photographs of `input`, or `only` some, into the folder `posed` of its run, and makes that its dataset.
-fn pose_into_run(input: &mut TrainInput, poses: Poses, only: Option<HashSet<PathBuf>>) -> Result<PoseReport> {
+/// Poses the capture `photos`, or `only` some of its photographs, into the folder `posed` of the run of `input`, and makes that its dataset.
+fn pose_into_run(
+    input: &mut TrainInput,
+    photos: &Path,
+    poses: Poses,
+    only: Option<HashSet<PathBuf>>,
+) -> Result<PoseReport> {
     let posed = input.out.join(POSED_FOLDER);
     note(format_args!("finding poses, which are written to {}", posed.display()));
-    let photos = photo_folder(input);
     input.data.clone_from(&posed);
     (input.reading.format, input.reading.images) = (None, None);
     let request = PoseInput {

@@ -178,8 +178,9 @@ pub fn run(args: &Args) -> Result<()> {
             }
             if finds_poses(&input) {
                 // Posing takes a while: mistakes are reported first.
-                input.clone().check().map_err(with_option_names)?;
+                let request = input.clone().check().map_err(with_option_names)?;
                 RunFolder::check_free(&input.out, input.overwrite)?;
+                request.check_resources().map_err(with_option_names)?;
                 let Some(mapper) = args.poses.map_or(Some(Poses::Irradia), PosesArg::mapper) else {
                     let message = format!("{} has no poses: omit --poses given", input.data.display());
                     return Err(Usage(message).into());
@@ -311,13 +312,17 @@ fn with_poses_of(from: &Path, mut input: TrainInput, poses: Option<PosesArg>) ->
 fn with_poses(input: TrainInput, poses: Option<PosesArg>, anyway: bool) -> Result<(TrainRequest, Dataset)> {
     let mut given = read(input.clone()).map_err(|error| naming_photographs(error, &input))?;
     RunFolder::check_free(&input.out, input.overwrite)?;
+    given.0.check_resources().map_err(with_option_names)?;
     // Rendered scenes are exact, and our own poses have been checked.
     let is_sure = || is_rendered(&given.1) || pose_source(&input.data) == Some(PoseSource::Irradia);
     match poses.map(PosesArg::mapper) {
         Some(Some(mapper)) => {
             let mut again = input;
             match mostly_unposed(&again, &given.1) {
-                Some(files) => drop(pose_all(&mut again, Some(files), mapper, anyway)?),
+                Some(files) => {
+                    let photos = photo_folder(&again);
+                    pose_all(&mut again, &photos, Some(files), mapper, anyway)?;
+                }
                 None => pose_again(&mut again, &given.1, mapper, anyway)?,
             }
             return read(again);
@@ -399,7 +404,8 @@ fn pose_others(mut input: TrainInput, given: &mut Dataset, files: HashSet<PathBu
     note(format_args!(
         "{line}: finding new ones; --poses given keeps the given ones"
     ));
-    let found = pose_all(&mut input, Some(files), Poses::Irradia, true).and_then(|report| {
+    let photos = photo_folder(&input);
+    let found = pose_all(&mut input, &photos, Some(files), Poses::Irradia, true).and_then(|report| {
         let n = report.registered;
         ensure!(n >= 2 * posed, "new ones were found for {n} only");
         read(input)

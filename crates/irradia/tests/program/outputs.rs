@@ -222,10 +222,10 @@ fn a_budget_covers_the_whole_recipe() {
 fn overwriting_removes_the_earlier_run() {
     let folder = with_run();
     let run = folder.path().join("run");
-    fs::write(run.join("eval/stale.png"), "x").expect("written");
+    fs::write(run.join("eval/stale.render.png"), "x").expect("written");
     fs::write(run.join("mine.txt"), "x").expect("written");
     irradia(folder.path(), "train data --out run --steps 5 --overwrite").success();
-    assert!(!run.join("eval/stale.png").exists() && run.join("mine.txt").exists());
+    assert!(!run.join("eval/stale.render.png").exists() && run.join("mine.txt").exists());
     assert_eq!(json(&run.join("report.json"))["steps"], 5);
     assert_eq!(events(&run).iter().filter(|e| e["event"] == "started").count(), 1);
 }

@@ -251,7 +251,10 @@ fn what_cannot_be_posed_is_refused_in_one_line() {
     irradia(folder.path(), "pose none --out x").refused(1, &["none"]);
     irradia(folder.path(), "pose empty --out x").refused(2, &["0 readable photographs"]);
     irradia(folder.path(), "pose text --out x").refused(2, &["a.jpg", "not a readable"]);
-    irradia(folder.path(), "pose film.mp4 --out x").refused(2, &["film.mp4", "ffmpeg"]);
+    // The film itself, not the photographs beside it.
+    for command in ["pose film.mp4 --out x", "train film.mp4 --out run"] {
+        irradia(folder.path(), command).refused(2, &["film.mp4", "ffmpeg"]);
+    }
     for command in ["pose film.zip --out x", "doctor film.zip", "train film.zip --out run"] {
         irradia(folder.path(), command).refused(1, &["film.zip is a file", "unpacked"]);
     }

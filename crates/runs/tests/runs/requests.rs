@@ -150,6 +150,61 @@ fn an_existing_run_is_replaced_only_on_request() {
 }
 
 #[test]
+fn a_replaced_run_leaves_the_files_of_others() {
+    let folder = folder();
+    let mut run = begin(folder.path(), "run", 3);
+    run.train(&mut []).expect("trains");
+    run.finish().expect("finishes");
+    let others = ["eval/notes.txt", "checkpoints/other.ckpt"].map(|name| folder.path().join("run").join(name));
+    others
+        .iter()
+        .for_each(|file| std::fs::write(file, "").expect("written"));
+    let request = || TrainInput {
+        overwrite: true,
+        ..input(folder.path(), "run", 3)
+    };
+    // A run cannot begin with the splats that it replaces.
+    let from_itself = TrainInput {
+        from: Some(folder.path().join("run")),
+        ..request()
+    };
+    let error = Run::begin_on(from_itself.check().expect("a request"), dataset()).err();
+    let error = error.expect("refused").to_string();
+    assert!(error.contains("choose another --out"), "{error}");
+    assert!(folder.path().join("run/scene.ply").is_file());
+    Run::begin_on(request().check().expect("a request"), dataset()).expect("replaced");
+    assert!(others.iter().all(|file| file.is_file()));
+    assert!(!folder.path().join("run/scene.ply").exists());
+}
+
+#[test]
+fn a_run_is_repeated_on_the_same_photographs_only() {
+    let folder = folder();
+    let mut run = begin(folder.path(), "run", 5);
+    run.train(&mut []).expect("trains");
+    run.finish().expect("finishes");
+    let replay = |out: &str| {
+        let input = TrainInput::replay_of(folder.path().join("run"), folder.path().join(out)).expect("a run");
+        input.check().expect("a request")
+    };
+    let mut other = dataset();
+    let first = other.train[0];
+    other.views[first].name = "another".to_owned();
+    let error = Run::begin_on(replay("other"), other)
+        .err()
+        .expect("refused")
+        .to_string();
+    assert!(
+        error.contains("changed") && !folder.path().join("other").exists(),
+        "{error}"
+    );
+    let mut again = Run::begin_on(replay("again"), dataset()).expect("a run");
+    again.train(&mut []).expect("trains");
+    again.finish().expect("finishes");
+    assert!(crate::scene(folder.path(), "again") == crate::scene(folder.path(), "run"));
+}
+
+#[test]
 fn a_request_round_trips() {
     let folder = folder();
     let asked = TrainInput {

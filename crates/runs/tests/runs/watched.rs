@@ -1,6 +1,6 @@
 //! Observers: stop, save and pause.
 
-use crate::{begin, dataset, folder, scene, unwatched};
+use crate::{begin, dataset, folder, input, scene, unwatched};
 use irradia_runs::prelude::*;
 use irradia_runs::train::EndReason;
 use std::fs;
@@ -100,6 +100,27 @@ fn a_stopped_run_is_saved_and_resumes_to_the_bytes_of_an_uninterrupted_one() {
     assert!(finished.complete);
     assert!(RunFolder::open(&path).expect("a run").1.complete);
     assert!(scene(folder.path(), "run") == unwatched(folder.path(), 12));
+}
+
+#[test]
+fn a_resumed_run_knows_what_was_found_before_its_first_step() {
+    let folder = folder();
+    let request = input(folder.path(), "run", 60).check().expect("a request");
+    let mut noted = dataset();
+    noted.warnings.push("new poses are used".to_owned());
+    let mut run = Run::begin_on(request, noted).expect("a run");
+    run.train(&mut [&mut SignalAt::new(20, Signal::Stop)]).expect("trains");
+    run.finish().expect("finishes");
+    let request = TrainInput::of_run(folder.path().join("run")).expect("a run").check();
+    let mut run = Run::resume_on(request.expect("a request"), dataset()).expect("a run");
+    run.train(&mut []).expect("trains");
+    let report = run.finish().expect("finishes").report;
+    assert!(
+        report.warnings.contains(&"new poses are used".to_owned()),
+        "{:?}",
+        report.warnings
+    );
+    assert!(report.total_seconds > report.seconds);
 }
 
 #[test]

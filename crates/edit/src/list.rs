@@ -7,10 +7,6 @@ use serde::{Deserialize, Serialize};
 
 /// The version of the layout that is written and read.
 const VERSION: u32 = 1;
-/// Maximum number of edits in a list, and of steps in a selection.
-const MAX_ITEMS: usize = 10_000;
-/// Maximum size of a list in bytes.
-const MAX_LIST_BYTES: usize = 64 << 20;
 
 /// Edits in the order of application. Each is in the coordinates of the scene after the edits before it.
 ///
@@ -209,15 +205,21 @@ struct RawList {
 }
 
 impl EditList {
+    /// Maximum number of edits in a list, and of steps in a selection.
+    pub const MAX_ITEMS: usize = 10_000;
+    /// Maximum size of a list in bytes.
+    pub const MAX_BYTES: usize = 64 << 20;
+
     /// Reads and checks the content of an `edits.toml`.
     ///
     /// # Errors
     /// One line that names the edit, when it is not TOML of this layout or a number is out of range.
     pub fn parse(text: &str) -> Result<Self, EditError> {
-        if text.len() > MAX_LIST_BYTES {
+        if text.len() > Self::MAX_BYTES {
             return Err(EditError::List(format!(
-                "it has {} bytes, at most {MAX_LIST_BYTES} are read",
-                text.len()
+                "it has {} bytes, at most {} are read",
+                text.len(),
+                Self::MAX_BYTES
             )));
         }
         let raw: RawList = toml::from_str(text).map_err(|error| {
@@ -257,10 +259,11 @@ impl EditList {
     /// # Errors
     /// [`EditError::InList`] for the first that is not.
     pub fn check(&self) -> Result<(), EditError> {
-        if self.edits.len() > MAX_ITEMS {
+        if self.edits.len() > Self::MAX_ITEMS {
             return Err(EditError::List(format!(
-                "it has {} edits, at most {MAX_ITEMS} are allowed",
-                self.edits.len()
+                "it has {} edits, at most {} are allowed",
+                self.edits.len(),
+                Self::MAX_ITEMS
             )));
         }
         for (i, edit) in self.edits.iter().enumerate() {
@@ -324,8 +327,9 @@ impl Edit {
             _ => {}
         }
         let steps = self.select.as_deref().unwrap_or_default();
-        if steps.len() > MAX_ITEMS {
-            let message = format!("has {} steps, at most {MAX_ITEMS} are allowed", steps.len());
+        if steps.len() > EditList::MAX_ITEMS {
+            let most = EditList::MAX_ITEMS;
+            let message = format!("has {} steps, at most {most} are allowed", steps.len());
             return Err(EditError::value(format!("{name} select"), message));
         }
         steps.iter().try_for_each(SelectStep::check)?;

@@ -1,6 +1,7 @@
 //! Editing from the pages: one session on a finished scene of splats, which all pages share. Their requests wait in a queue; a
 //! separate thread carries them out, shows the resulting scene and informs every page.
 
+mod entry_text;
 mod save;
 mod session;
 mod uploads;

@@ -1,6 +1,7 @@
 //! A scene with the list of its selections and edits; those after the current position are undone.
 
 use super::EditingError;
+use super::entry_text::{edit_text, select_text};
 use super::uploads::Uploads;
 use super::world::{operation_to_dataset, placement, step_to_dataset};
 use irradia_edit::{
@@ -14,10 +15,13 @@ use std::sync::Arc;
 
 /// Maximum bytes of earlier states that are kept for an immediate undo; without a kept state, undo makes the edits again.
 const MAX_SNAPSHOT_BYTES: usize = 1 << 30;
-/// Maximum number of entries in the list. A selection may take 60 kB.
-const MAX_ENTRIES: usize = 20_000;
-/// Maximum count of numbers in all selections of the list.
+/// Maximum number of entries: a selection for each edit of the longest list. A selection may take 60 kB.
+const MAX_ENTRIES: usize = 2 * EditList::MAX_ITEMS;
+/// Maximum count of numbers in the selections of all entries.
 const MAX_SELECTION_NUMBERS: usize = 8_000_000;
+/// Maximum count of numbers in the selections of edits, such that the written list can be read again: a pixel's coordinate takes up to 26
+/// bytes in it.
+const MAX_LISTED_NUMBERS: usize = EditList::MAX_BYTES / 32;
 
 /// The action of an entry.
 #[derive(Clone, Debug)]
@@ -246,7 +250,7 @@ impl Session {
     /// # Errors
     /// When nothing is selected, or the edit is not possible; nothing has changed then.
     pub fn edit(&mut self, gesture: u64, whole: bool, mut op: Operation) -> Result<(), EditError> {
-        self.check_capacity(&[])?;
+        self.check_capacity(if whole { &[] } else { &self.steps })?;
         operation_to_dataset(&mut op, self.world());
         self.replace_gesture(gesture, |session| {
             if !whole && session.selected.is_empty() {
@@ -323,18 +327,25 @@ impl Session {
         std::mem::take(&mut self.notes)
     }
 
+    /// Checks that there is room for an entry with `steps`.
     fn check_capacity(&self, steps: &[SelectStep]) -> Result<(), EditError> {
-        let points = |steps: &[SelectStep]| steps.iter().map(count_numbers).sum::<usize>();
-        let all: usize = self
-            .entries
-            .iter()
-            .map(|entry| match &entry.action {
-                EntryAction::Select { steps, .. } => points(steps),
-                EntryAction::Edit(edit, _) => points(edit.select.as_deref().unwrap_or_default()),
-                EntryAction::Deselect => 0,
-            })
-            .sum();
-        if self.entries.len() >= MAX_ENTRIES || all + points(steps) > MAX_SELECTION_NUMBERS {
+        let numbers = |steps: &[SelectStep]| steps.iter().map(count_numbers).sum::<usize>();
+        let (mut all, mut listed) = (numbers(steps), numbers(steps));
+        for entry in &self.entries {
+            match &entry.action {
+                EntryAction::Select { steps, .. } => all += numbers(steps),
+                EntryAction::Edit(edit, _) => {
+                    let count = numbers(edit.select.as_deref().unwrap_or_default());
+                    (all, listed) = (all + count, listed + count);
+                }
+                EntryAction::Deselect => {}
+            }
+        }
+        if self.entries.len() >= MAX_ENTRIES
+            || self.edits().count() >= EditList::MAX_ITEMS
+            || all > MAX_SELECTION_NUMBERS
+            || listed > MAX_LISTED_NUMBERS
+        {
             let message = "the list of edits is full: save the scene and open the saved one";
             return Err(EditError::Scene(message.to_owned()));
         }
@@ -511,71 +522,10 @@ fn cloud_bytes(cloud: &GaussianCloud) -> usize {
     4 * cloud.len() * (11 + 3 * cloud.sh_coefficients())
 }
 
-/// The text of a selection in the list.
-fn select_text(steps: &[SelectStep], replace: bool) -> String {
-    let Some(first) = steps.first() else {
-        return String::new();
-    };
-    let connected = steps.iter().find(|step| matches!(step.shape, Shape::Connected { .. }));
-    let named = &connected.unwrap_or(first).shape;
-    let name = match named {
-        Shape::All {} => "All",
-        Shape::Box { .. } => "Box",
-        Shape::Sphere { .. } => "Sphere",
-        Shape::HalfSpace { .. } => "Half-space",
-        Shape::Polygon { .. } => "Outline",
-        Shape::Brush { .. } => "Brush",
-        Shape::Color { .. } => "Colour",
-        Shape::Opacity { .. } => "Opacity",
-        Shape::Size { .. } => "Size",
-        Shape::Elongation { .. } => "Elongation",
-        Shape::Views { .. } => "Views",
-        Shape::Clusters { .. } => "Clusters",
-        Shape::Floaters { .. } => "Floaters",
-        Shape::Subject { .. } => "Subject",
-        Shape::Invert {} => "Invert",
-        Shape::Grow { .. } => "Grow",
-        Shape::Connected { .. } => "Connected",
-        Shape::Last {} => "Last",
-    };
-    match (replace, first.mode) {
-        (false, Mode::Add) if !matches!(named, Shape::Invert {} | Shape::Grow { .. } | Shape::Connected { .. }) => {
-            format!("+ {name}")
-        }
-        (_, Mode::Subtract) => format!("− {name}"),
-        (_, Mode::Intersect) => format!("∩ {name}"),
-        _ => name.to_owned(),
-    }
-}
-
-/// The text of an edit of `selected` splats in the list.
-fn edit_text(op: &Operation, selected: usize, before: usize, after: usize) -> String {
-    let verb = match op {
-        Operation::Delete {} => return format!("Delete {}", before - after),
-        Operation::Keep {} => return format!("Keep {after}"),
-        Operation::Reduce { .. } => return format!("Reduce to {after}"),
-        Operation::Upright { .. } => return "Set upright".to_owned(),
-        Operation::SetLength { .. } => return "Set scale".to_owned(),
-        Operation::Merge { .. } => return "Merge".to_owned(),
-        Operation::Split { name } => return format!("Split off {name}"),
-        Operation::Show {} => return "Show all".to_owned(),
-        Operation::Unlock {} => return "Unlock all".to_owned(),
-        Operation::Move { .. } => "Move",
-        Operation::Rotate { .. } => "Rotate",
-        Operation::Scale { .. } => "Scale",
-        Operation::Duplicate { .. } => "Duplicate",
-        Operation::Recolor { .. } => "Recolour",
-        Operation::Opacity { .. } => "Opacity of",
-        Operation::Hide {} => "Hide",
-        Operation::Lock {} => "Lock",
-    };
-    format!("{verb} {selected}")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use irradia_edit::open_nothing;
+    use irradia_edit::{Viewpoint, open_nothing};
 
     /// Splats at 0, 1, .. along x, in a world of half the dataset's unit.
     fn session(n: usize) -> Session {
@@ -610,6 +560,15 @@ mod tests {
 
     fn xs(session: &Session) -> Vec<f32> {
         session.draft().cloud.means.iter().map(|mean| mean[0]).collect()
+    }
+
+    /// Size of an edit in a list.
+    fn edit_bytes(edit: &Edit) -> usize {
+        let list = |edits| EditList {
+            edits,
+            ..EditList::default()
+        };
+        list(vec![edit.clone()]).to_toml().len()
     }
 
     /// What the saved list makes of the scene as it was opened.
@@ -729,6 +688,39 @@ mod tests {
             error.starts_with("edit 3: merge: ") && opened.position() == 2,
             "{error}"
         );
+    }
+
+    #[test]
+    fn a_list_that_can_be_made_can_be_read_again() {
+        let list = EditList {
+            edits: vec![Edit::of_scene(Operation::Move { by: [0.001, 0.0, 0.0] }); EditList::MAX_ITEMS / 2 + 1],
+            ..EditList::default()
+        };
+        let mut session = session(1);
+        session.replay(&list).expect("half of what is allowed");
+        let error = session.replay(&list).expect_err("too many").to_string();
+        assert!(error.contains("the list of edits is full"), "{error}");
+        assert_eq!(session.edits().count(), EditList::MAX_ITEMS);
+        assert_eq!(
+            EditList::parse(&session.list().to_toml()).expect("a list"),
+            session.list()
+        );
+        // So can one of outlines, of which each edit has its own.
+        let outline = SelectStep::add(Shape::Polygon {
+            camera: Viewpoint {
+                position: [0.1, 0.2, -4.0],
+                rotation: [1.0, 0.0, 0.0, 0.0],
+                focal: [50.0; 2],
+                principal: [32.0, 24.0],
+                size: [64, 48],
+            },
+            points: (1..=2000).map(|i| [1.0 / f64::from(i), 16e3 / f64::from(i)]).collect(),
+            visible: true,
+        });
+        let edit = Edit::of(Operation::Opacity { factor: 1.0 }, [outline]);
+        let bytes = edit_bytes(&edit);
+        let most = MAX_LISTED_NUMBERS / count_numbers(&edit.select.expect("steps")[0]);
+        assert!(most * bytes <= EditList::MAX_BYTES, "{most} edits of {bytes} bytes");
     }
 
     #[test]

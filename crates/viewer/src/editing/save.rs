@@ -63,12 +63,25 @@ pub(crate) fn stem_of(source: &Path) -> String {
     stem.filter(|stem| !stem.is_empty()).unwrap_or("scene").to_owned()
 }
 
+/// Names of the files in a folder; none if it cannot be read.
+fn names_in(folder: &Path) -> Vec<String> {
+    let folder = if folder.as_os_str().is_empty() {
+        Path::new(".")
+    } else {
+        folder
+    };
+    let entries = fs::read_dir(folder).into_iter().flatten().flatten();
+    entries
+        .map(|entry| entry.file_name().to_string_lossy().into_owned())
+        .collect()
+}
+
 /// Writes the list, the scene, the scenes that were split off and those that pages sent to be merged; to the same files as before if the
 /// session has been saved.
 pub(super) fn save(session: &Session, source: &Path, before: Option<&Saved>) -> Result<Saved, EditingError> {
     let stem = stem_of(source);
     let folder = folder_of(source);
-    let names = |number: usize| {
+    let paths = |number: usize| {
         let end = if number == 1 {
             String::new()
         } else {
@@ -80,10 +93,15 @@ pub(super) fn save(session: &Session, source: &Path, before: Option<&Saved>) -> 
     };
     let (list, scene) = match before {
         Some(before) => (before.list.clone(), before.scene.clone()),
-        None => (1..)
-            .map(names)
-            .find(|(list, scene)| !list.exists() && !scene.exists())
-            .expect("some number is free"),
+        None => {
+            let names = names_in(folder);
+            // Parts and cameras are beside the scene, with its name, and may be left where the scene was renamed.
+            let is_free = |(list, scene): &(PathBuf, PathBuf)| {
+                let beside = format!("{}.", stem_of(scene));
+                !list.exists() && !scene.exists() && !names.iter().any(|name| name.starts_with(&beside))
+            };
+            (1..).map(paths).find(is_free).expect("some number is free")
+        }
     };
     let parts = session.parts()?;
     write_splats(&scene, &session.draft().visible_cloud())?;
@@ -180,7 +198,7 @@ fn new_unsaved_path(source: &Path) -> PathBuf {
 mod tests {
     use super::*;
     use crate::editing::uploads::Uploads;
-    use irradia_edit::{Draft, Operation};
+    use irradia_edit::{Draft, Operation, SelectStep, Shape};
     use irradia_runs::scene::GaussianCloud;
 
     #[test]
@@ -200,20 +218,52 @@ mod tests {
         }
     }
 
+    /// A session on a scene of `n` splats that is read from `folder`.
+    fn session(n: usize, folder: &Path) -> Session {
+        let cloud = GaussianCloud {
+            means: (0..n).map(|i| [i as f32, 0.0, 0.0]).collect(),
+            quats: vec![[1.0, 0.0, 0.0, 0.0]; n],
+            log_scales: vec![[-2.0; 3]; n],
+            opacity_logits: vec![1.0; n],
+            sh: vec![0.3; 3 * n],
+            ..GaussianCloud::default()
+        };
+        Session::new(Draft::new(cloud, Vec::new()), Arc::new(Uploads::new(folder)))
+    }
+
+    #[test]
+    fn a_part_of_an_earlier_session_is_not_replaced() {
+        let folder = tempfile::tempdir().unwrap();
+        let source = folder.path().join("a.ply");
+        let save_part = |radius| {
+            let mut session = session(4, folder.path());
+            let ball = SelectStep::add(Shape::Sphere {
+                center: [0.0; 3],
+                radius,
+            });
+            session.select(1, true, vec![ball]).unwrap();
+            session
+                .edit(2, false, Operation::Split { name: "part".into() })
+                .unwrap();
+            save(&session, &source, None).unwrap()
+        };
+        let first = save_part(0.5);
+        let part = fs::read(folder.path().join("a.edited.part-1.ply")).unwrap();
+        for path in [&first.list, &first.scene] {
+            let other = path.file_name().unwrap().to_string_lossy().replace("a.", "mine.");
+            fs::rename(path, folder.path().join(other)).unwrap();
+        }
+        let second = save_part(2.5);
+        assert_eq!(second.line(), "saved a.edits-2.toml and a.edited-2.ply and a part");
+        assert_eq!(fs::read(&first.parts[0]).unwrap(), part);
+    }
+
     #[test]
     fn edits_that_are_not_saved_are_in_one_file() {
         let folder = tempfile::tempdir().unwrap();
         let source = folder.path().join("a.ply");
-        let cloud = GaussianCloud {
-            means: vec![[0.0; 3]],
-            quats: vec![[1.0, 0.0, 0.0, 0.0]],
-            log_scales: vec![[-2.0; 3]],
-            opacity_logits: vec![1.0],
-            sh: vec![0.3; 3],
-            ..GaussianCloud::default()
-        };
         let file = folder.path().join("a.unsaved-1.toml");
-        let mut session = Session::new(Draft::new(cloud, Vec::new()), Arc::new(Uploads::new(folder.path())));
+        let mut session = session(1, folder.path());
         let mut unsaved = UnsavedEdits::default();
         let mut keep = |session: &Session, saved: Option<&Saved>| {
             let list = session.list().to_toml().into();

@@ -1,7 +1,7 @@
 //! What is shown: a finished scene, or the state of a training.
 
 use crate::ViewerError;
-use crate::editing::Editing;
+use crate::editing::{Editing, file_state};
 use crate::levels::Levels;
 use crate::live::{Live, Watcher};
 use crate::views::Views;
@@ -125,6 +125,8 @@ impl Subject {
             .and_then(|folder| std::fs::read_to_string(folder.file("recipe.toml")).ok());
         // A scene that was moved away from its photographs has another unit as well.
         let folder = folder.filter(|_| !is_moved(&file));
+        // Before the scene is read: if the file is replaced meanwhile, it does not count as the one that is shown.
+        let opened = file_state(&file);
         let mut scene = Scene::read(&file)?;
         let mut warnings = std::mem::take(&mut scene.notes);
         // The viewer draws pinhole pictures, which are compared with undistorted photographs.
@@ -168,7 +170,7 @@ impl Subject {
         });
         let moved = moved_from_run(&file);
         let editing = match &scene.model {
-            Model::Splats { splats, residual: None } => Ok(Editing::new(file, splats.len())),
+            Model::Splats { splats, residual: None } => Ok(Editing::new(file, opened, splats.len())),
             Model::Splats { .. } => {
                 Err("Splats with a residual field cannot be edited: their colours are in the field.")
             }

@@ -15,8 +15,10 @@ use irradia_runs::formats::{FormatError, read_splats};
 use irradia_scene::GaussianCloud;
 use serde_json::Value;
 use std::collections::VecDeque;
-use std::path::PathBuf;
+use std::fs;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::SystemTime;
 use tokio::sync::watch;
 
 use save::folder_of;
@@ -32,6 +34,9 @@ const MAX_WAITING: usize = 64;
 /// Why a request of a page is not fulfilled.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum EditingError {
+    /// The file is no longer the one that pages show.
+    #[error("{} has changed since it was opened: start irradia view again to edit it", .0.display())]
+    Changed(PathBuf),
     #[error(transparent)]
     Edit(#[from] EditError),
     #[error(transparent)]
@@ -49,9 +54,20 @@ struct Queue {
 /// The edited scene and its list of edits as TOML.
 type EditedScene = (Arc<Draft>, Arc<str>);
 
+/// Length of a file and when it was written; `None` if it cannot be told.
+pub(crate) type FileState = Option<(u64, SystemTime)>;
+
+/// The state of the file `path`.
+pub(crate) fn file_state(path: &Path) -> FileState {
+    let metadata = fs::metadata(path).ok()?;
+    Some((metadata.len(), metadata.modified().ok()?))
+}
+
 pub(crate) struct Editing {
     /// The file of the scene.
     pub source: PathBuf,
+    /// Its state before the scene that pages show was read from it.
+    opened: FileState,
     /// Scenes to merge.
     pub uploads: Arc<Uploads>,
     queue: Mutex<Queue>,
@@ -67,9 +83,10 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Editing {
-    /// A session on the scene in the file `source`, which has `splats` splats.
-    pub fn new(source: PathBuf, splats: usize) -> Self {
+    /// A session on the scene in the file `source`, which has `splats` splats and was read when the file was in the state `opened`.
+    pub fn new(source: PathBuf, opened: FileState, splats: usize) -> Self {
         Self {
+            opened,
             uploads: Arc::new(Uploads::new(folder_of(&source))),
             source,
             queue: Mutex::default(),
@@ -139,14 +156,27 @@ impl Editing {
         lock(&self.current).clone()
     }
 
+    /// The splats of the scene as it was opened.
+    ///
+    /// # Errors
+    /// When its file can no longer be read, or has changed.
+    fn read_source(&self) -> Result<GaussianCloud, EditingError> {
+        let cloud = read_splats(&self.source)?;
+        // Checked last, since the file may be replaced while it is read.
+        if file_state(&self.source) != self.opened {
+            return Err(EditingError::Changed(self.source.clone()));
+        }
+        Ok(cloud)
+    }
+
     /// The splats to write.
     ///
     /// # Errors
-    /// When nothing has been edited, and the file of the scene can no longer be read.
-    pub fn cloud(&self) -> Result<GaussianCloud, FormatError> {
+    /// When nothing has been edited, and the file of the scene can no longer be read, or has changed.
+    pub fn cloud(&self) -> Result<GaussianCloud, EditingError> {
         match self.current() {
             Some((draft, _)) => Ok(draft.visible_cloud().into_owned()),
-            None => read_splats(&self.source),
+            None => self.read_source(),
         }
     }
 
@@ -172,7 +202,7 @@ mod tests {
             sh: vec![0.3; 6],
             ..GaussianCloud::default()
         };
-        let editing = Editing::new("a.ply".into(), 2);
+        let editing = Editing::new("a.ply".into(), None, 2);
         let mut session = Session::new(Draft::new(cloud, Vec::new()), editing.uploads.clone());
         let opened = editing.set_current(&session);
         session

@@ -6,7 +6,6 @@ use super::{Editing, EditingError};
 use crate::message::EditRequest;
 use crate::subject::Subject;
 use irradia_edit::{Draft, EditList, Selection, Transform};
-use irradia_runs::formats::read_splats;
 use irradia_runs::{Scene, photographs_of};
 use irradia_splat::{RenderOptions, Splats};
 use serde_json::{Value, json};
@@ -90,7 +89,7 @@ pub(crate) fn run_editing(
 
 impl Workspace {
     fn open(editing: &Editing, subject: &Subject) -> Result<Self, EditingError> {
-        let cloud = read_splats(&editing.source)?;
+        let cloud = editing.read_source()?;
         let edition = subject.edition();
         let scene = edition.as_ref().map(|edition| edition.scene());
         let cameras = scene.and_then(|scene| scene.cameras.as_deref()).unwrap_or_default();

@@ -3,7 +3,7 @@
 use crate::client::{Socket, TOO_LARGE};
 use crate::security::{Served, serve};
 use irradia_runs::Editing;
-use irradia_runs::formats::{SplatFormat, encode_splats, read_splats};
+use irradia_runs::formats::{SplatFormat, encode_splats, read_splats, write_splats};
 use serde_json::{Value, json};
 use std::fs;
 
@@ -83,6 +83,25 @@ fn pages_share_a_session_that_leaves_the_source_alone() {
     request_state(&mut third, &select_right_splat(), ("selected", json!(1)));
     let name = json!("saved scene.edits-2.toml and scene.edited-2.ply");
     request_state(&mut third, &json!({ "do": "save" }), ("saved", name));
+}
+
+#[test]
+fn a_scene_that_was_replaced_since_it_was_opened_is_not_edited() {
+    let served = serve("127.0.0.1");
+    let mut page = page(&served);
+    let mut cloud = read_splats(served.scene()).expect("splats");
+    cloud.means[0][1] = 5.0;
+    fs::remove_file(served.scene()).expect("removed");
+    write_splats(served.scene(), &cloud).expect("written");
+    for _ in 0..2 {
+        let line = refusal(&mut page, &select_right_splat());
+        assert!(
+            line.ends_with("scene.ply has changed since it was opened: start irradia view again to edit it"),
+            "{line}"
+        );
+    }
+    assert_ne!(served.status("/download/ply", &[&served.host()]), 200);
+    served.assert_draws();
 }
 
 #[test]

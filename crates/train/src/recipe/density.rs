@@ -9,6 +9,33 @@ use irradia_splat::densify::merge::MergeOptions;
 use irradia_splat::densify::taming::{ScoreWeights, TamingOptions};
 use serde::{Deserialize, Serialize};
 
+/// A number of a recipe: its key, its value, whether it is in range, and the range in words.
+type Checked = (&'static str, f32, bool, &'static str);
+
+fn at_least_one(key: &'static str, steps: u64) -> Checked {
+    (key, steps as f32, steps >= 1, "1 or more")
+}
+
+fn not_negative(key: &'static str, value: f32) -> Checked {
+    (key, value, value >= 0.0, "0 or more")
+}
+
+fn opacity(key: &'static str, value: f32) -> Checked {
+    (key, value, (0.0..1.0).contains(&value), "at least 0 and below 1")
+}
+
+fn reset_to(value: f32) -> Checked {
+    ("reset_to", value, value > 0.0 && value < 1.0, "above 0 and below 1")
+}
+
+/// Names the first number that is out of range.
+fn check(values: &[Checked]) -> Result<(), String> {
+    match values.iter().find(|(_, _, is_valid, _)| !is_valid) {
+        Some((key, value, _, range)) => Err(format!("{key} is {value}: it must be {range}")),
+        None => Ok(()),
+    }
+}
+
 /// A strategy.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "strategy", rename_all = "snake_case")]
@@ -31,6 +58,53 @@ impl DensityControl {
             DensityControl::Mcmc(settings) => settings.every,
             DensityControl::Taming(settings) => settings.every,
             DensityControl::Fast(settings) => settings.every,
+        }
+    }
+
+    /// Checks that every number is in range.
+    pub(super) fn validate(&self) -> Result<(), String> {
+        match self {
+            DensityControl::Classic(settings) => check(&[
+                at_least_one("every", settings.every),
+                not_negative("gradient_threshold", settings.gradient_threshold),
+                not_negative("small", settings.small),
+                opacity("min_opacity", settings.min_opacity),
+                not_negative("max_scale", settings.max_scale),
+                reset_to(settings.reset_to),
+            ]),
+            DensityControl::Mcmc(settings) => check(&[
+                at_least_one("every", settings.every),
+                ("growth", settings.growth, settings.growth >= 1.0, "1 or more"),
+                opacity("min_opacity", settings.min_opacity),
+            ]),
+            DensityControl::Taming(settings) => check(&[
+                at_least_one("every", settings.every),
+                not_negative("gradient_threshold", settings.gradient_threshold),
+                not_negative("small", settings.small),
+                opacity("min_opacity", settings.min_opacity),
+                not_negative("max_scale", settings.max_scale),
+                reset_to(settings.reset_to),
+                (
+                    "edge_share",
+                    settings.edge_share,
+                    (0.0..=1.0).contains(&settings.edge_share),
+                    "0 to 1",
+                ),
+                not_negative("score_gradient", settings.score_gradient),
+                not_negative("score_error", settings.score_error),
+                not_negative("score_weight", settings.score_weight),
+                not_negative("score_opacity", settings.score_opacity),
+                not_negative("score_extent", settings.score_extent),
+                not_negative("score_volume", settings.score_volume),
+            ]),
+            DensityControl::Fast(settings) => check(&[
+                at_least_one("every", settings.every),
+                opacity("min_opacity", settings.min_opacity),
+                not_negative("min_weight", settings.min_weight),
+                not_negative("error_threshold", settings.error_threshold),
+                not_negative("min_extent", settings.min_extent),
+                not_negative("floor", settings.floor),
+            ]),
         }
     }
 
@@ -263,6 +337,15 @@ documented! {
 }
 
 impl MergeSettings {
+    /// Checks that every number is in range.
+    pub(super) fn validate(&self) -> Result<(), String> {
+        check(&[
+            at_least_one("every", self.every),
+            not_negative("distance", self.distance),
+            not_negative("color", self.color),
+        ])
+    }
+
     /// The strategy's options.
     pub fn options(&self) -> MergeOptions {
         MergeOptions {

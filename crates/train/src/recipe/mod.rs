@@ -1,6 +1,7 @@
 //! A recipe: a training configuration, as a file. Raw TOML, then overrides, then this validated value.
 
 mod ablation;
+mod check;
 mod choice;
 mod density;
 mod field;
@@ -14,7 +15,6 @@ pub use density::{ClassicSettings, DensityControl, FastSettings, McmcSettings, M
 pub use field::{FieldSettings, FieldSpace, ResidualSettings};
 use irradia_splat::regularize::Regularized;
 use keys::documented;
-use param::check_knob;
 pub use param::{Knob, Params, Shape, Values};
 use serde::{Deserialize, Serialize};
 pub use table::{Group, Param, Row};
@@ -75,7 +75,7 @@ documented! {
         pub about: String,
         /// Maximum number of splats; at least 1.
         pub max_splats: usize,
-        /// Maximum number of splats per pixel of a training image, averaged over views; no such limit when absent.
+        /// Maximum number of splats per pixel of a training image, averaged over views, above 0; no such limit when absent.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         pub splats_per_pixel: Option<f32>,
         /// Distance from each training camera within which splats up to 60 degrees from its axis are removed at every round of density
@@ -178,7 +178,7 @@ documented! {
     #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(deny_unknown_fields)]
     pub struct RenderSettings {
-        /// Background colour, sRGB; images with alpha are composited over it.
+        /// Background colour, sRGB, each channel 0 to 1; images with alpha are composited over it.
         pub background: [f32; 3],
         /// Scale opacities by the area ratio of the 0.3 pixel dilation.
         pub antialias: bool,
@@ -508,128 +508,10 @@ impl Recipe {
     pub fn total_steps(&self) -> u64 {
         self.stage.iter().map(|s| s.steps).sum()
     }
-
-    fn validate(&self) -> Result<(), String> {
-        let AdamSettings {
-            beta1, beta2, epsilon, ..
-        } = self.adam;
-        for (name, beta) in [("beta1", beta1), ("beta2", beta2)] {
-            if !(0.0..1.0).contains(&beta) {
-                return Err(format!("adam.{name} = {beta} must be at least 0 and below 1"));
-            }
-        }
-        if !(epsilon.is_finite() && epsilon > 0.0) {
-            return Err(format!(
-                "adam.epsilon = {epsilon} must be above 0: splats without a gradient would turn into NaN"
-            ));
-        }
-        if self.stage.is_empty() {
-            return Err("there must be at least one [[stage]]".into());
-        }
-        if self.max_splats == 0 || self.eval_every == 0 || self.checkpoint_every == 0 {
-            return Err("max_splats, eval_every and checkpoint_every must be at least 1".into());
-        }
-        let lengths = [
-            ("free_space", self.free_space),
-            ("extent_pixels", self.extent_pixels),
-            ("length_exponent", self.length_exponent),
-        ];
-        if let Some((name, value)) = lengths.iter().find(|(_, value)| !(value.is_finite() && *value >= 0.0)) {
-            return Err(format!("{name} is {value}: it must be 0 or more, and finite"));
-        }
-        let opacities = [self.init.opacity, self.init.random_opacity.unwrap_or(self.init.opacity)];
-        if opacities.iter().any(|opacity| !(*opacity > 0.0 && *opacity < 1.0)) || self.init.scale <= 0.0 {
-            return Err("init.opacity and random_opacity must be between 0 and 1 and init.scale above 0".into());
-        }
-        if let Some(field) = &self.field {
-            field.validate()?;
-        }
-        for (name, settings, images) in [("residual", &self.residual, 0), ("appearance", &self.appearance, 1)] {
-            if let Some(settings) = settings {
-                settings.validate(name, images)?;
-            }
-        }
-        for (i, stage) in self.stage.iter().enumerate() {
-            self.validate_order(i)?;
-            if stage.steps == 0 {
-                return Err(format!("stage.{}.steps must be at least 1", stage.name));
-            }
-            if self.stage[..i].iter().any(|s| s.name == stage.name) {
-                return Err(format!("two stages are called {}", stage.name));
-            }
-            if stage.density.as_ref().is_some_and(|density| density.every() == 0)
-                || stage.merge.as_ref().is_some_and(|merge| merge.every == 0)
-            {
-                return Err(format!(
-                    "stage.{}: density.every and merge.every must be at least 1",
-                    stage.name
-                ));
-            }
-            if let Some(DensityControl::Taming(settings)) = &stage.density
-                && !(0.0..=1.0).contains(&settings.edge_share)
-            {
-                return Err(format!(
-                    "stage.{}.density.edge_share must be between 0 and 1",
-                    stage.name
-                ));
-            }
-            let sensible = match stage.exit {
-                None => true,
-                Some(Exit::Threshold { tau }) => tau > 0.0,
-                Some(Exit::Relative { ratio }) => ratio > 0.0 && ratio < 1.0,
-                Some(Exit::Plateau { drop, window }) => (0.0..1.0).contains(&drop) && window > 0,
-            };
-            if !sensible {
-                return Err(format!(
-                    "stage.{}.exit: tau and window must be above 0, ratio and drop between 0 and 1",
-                    stage.name
-                ));
-            }
-        }
-        let everywhere = [
-            ("params".to_owned(), &self.params),
-            ("known_space".to_owned(), &self.known_space),
-            ("cut_out".to_owned(), &self.cut_out),
-            ("skies".to_owned(), &self.skies),
-            ("large".to_owned(), &self.large),
-        ];
-        let stages = self
-            .stage
-            .iter()
-            .map(|s| (format!("stage.{}.params", s.name), &s.params));
-        for (place, params) in everywhere.into_iter().chain(stages) {
-            for (param, knob) in params {
-                check_knob(*param, knob).map_err(|why| format!("{place}.{}: {why}", param.name()))?;
-            }
-        }
-        Ok(())
-    }
 }
 
 fn is_default<T: Default + PartialEq>(value: &T) -> bool {
     *value == T::default()
-}
-
-impl Recipe {
-    /// Checks that what stage `i` trains can follow the stage before it.
-    fn validate_order(&self, i: usize) -> Result<(), String> {
-        let stage = &self.stage[i];
-        let before = i.checked_sub(1).map(|before| self.stage[before].represents);
-        let name = &stage.name;
-        match (stage.represents, before) {
-            (Represents::Field, _) if self.field.is_none() => {
-                Err(format!("stage.{name} trains a field, but there is no [field]"))
-            }
-            (Represents::Field, Some(Represents::Splats)) => Err(format!("stage.{name}: a field cannot follow splats")),
-            (Represents::Field, _) if stage.density.is_some() || stage.merge.is_some() => {
-                Err(format!("stage.{name}: a field has neither density control nor merging"))
-            }
-            (Represents::Splats, Some(Represents::Field)) if self.field.as_ref().is_none_or(|f| f.points == 0) => Err(
-                format!("stage.{name} begins with splats on a field's surfaces: set their number in field.points"),
-            ),
-            _ => Ok(()),
-        }
-    }
 }
 
 /// Sets one value by its path; in a list of tables (`stage`) an item is selected by its `name`.

@@ -8,7 +8,7 @@ use irradia_scene::{Dataset, sh};
 use irradia_splat::Splats;
 use irradia_train::Recipe;
 use irradia_train::paces::Paces;
-use irradia_train::recipe::{Param, Represents};
+use irradia_train::recipe::{Param, Represents, is_assigned};
 use irradia_train::schedule::{OutlinePoint, outline};
 use serde::{Deserialize, Serialize};
 use std::fmt::Display;
@@ -349,11 +349,7 @@ impl TrainRequest {
             // The recipe of the run to repeat already contains it.
             return Ok(());
         }
-        let is_set = self
-            .input
-            .set
-            .iter()
-            .any(|change| change.starts_with("render.background"));
+        let is_set = is_assigned(&self.input.set, "render.background");
         if self.input.background.is_none() {
             if is_set {
                 self.recipe.unset(Param::CoverWeight);
@@ -441,6 +437,21 @@ mod tests {
         assert_eq!(finest(|input| input.steps = Some(60)), (false, 0));
         let set = |input: &mut TrainInput| input.set = vec!["field.net.encoding.finest=512".into()];
         assert_eq!(finest(set), (false, 3), "what is set takes precedence");
+    }
+
+    #[test]
+    fn a_background_that_is_set_in_any_form_is_kept() {
+        for change in [
+            " render.background=[1,0,0]",
+            "render={background=[1,0,0],antialias=false}",
+        ] {
+            let mut input = TrainInput::new("photos", "run");
+            input.set = vec![change.to_owned()];
+            let mut request = input.check().expect("valid");
+            request.choose_background(&Dataset::default()).expect("set");
+            assert_eq!(request.recipe.render.background, [1.0, 0.0, 0.0], "{change}");
+            assert!(!request.recipe.uses(Param::CoverWeight), "{change}");
+        }
     }
 
     #[test]

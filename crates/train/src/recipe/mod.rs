@@ -1,6 +1,7 @@
 //! A recipe: a training configuration, as a file. Raw TOML, then overrides, then this validated value.
 
 mod ablation;
+mod assignment;
 mod check;
 mod choice;
 mod density;
@@ -10,6 +11,8 @@ mod param;
 mod table;
 
 pub use ablation::Ingredients;
+use assignment::apply;
+pub use assignment::is_assigned;
 pub use choice::Choice;
 pub use density::{ClassicSettings, DensityControl, FastSettings, McmcSettings, MergeSettings, TamingSettings};
 pub use field::{FieldSettings, FieldSpace, ResidualSettings};
@@ -406,10 +409,7 @@ impl Recipe {
             }
         })?;
         recipe.validate().map_err(invalid)?;
-        let is_set = |param: &Param| {
-            let mut paths = overrides.iter().filter_map(|given| given.split_once('='));
-            paths.any(|(path, _)| path.trim().strip_prefix("params.") == Some(param.name()))
-        };
+        let is_set = |param: &Param| is_assigned(overrides, &format!("params.{}", param.name()));
         for params in recipe.conditional_mut() {
             params.retain(|param, _| !is_set(param));
         }
@@ -512,45 +512,6 @@ impl Recipe {
 
 fn is_default<T: Default + PartialEq>(value: &T) -> bool {
     *value == T::default()
-}
-
-/// Sets one value by its path; in a list of tables (`stage`) an item is selected by its `name`.
-fn apply(root: &mut toml::Value, assignment: &str) -> Result<(), String> {
-    let (path, value) = assignment.split_once('=').ok_or("expected key=value")?;
-    let value: toml::Value = format!("v = {value}")
-        .parse::<toml::Table>()
-        .or_else(|_| format!("v = {value:?}").parse::<toml::Table>())
-        .map_err(|_| format!("`{value}` is not a TOML value"))?
-        .remove("v")
-        .ok_or("no value")?;
-    let keys: Vec<&str> = path.trim().split('.').collect();
-    let (last, parents) = keys.split_last().expect("split gives at least one");
-    let mut at = root;
-    for key in parents {
-        at = match at {
-            toml::Value::Table(table) => table
-                .entry(*key)
-                .or_insert_with(|| toml::Value::Table(toml::Table::new())),
-            toml::Value::Array(items) => {
-                let names: Vec<String> = items
-                    .iter()
-                    .filter_map(|i| i.get("name")?.as_str().map(str::to_owned))
-                    .collect();
-                items
-                    .iter_mut()
-                    .find(|item| item.get("name").and_then(toml::Value::as_str) == Some(key))
-                    .ok_or_else(|| format!("no `{key}` there; there are {}", names.join(", ")))?
-            }
-            other => return Err(format!("`{key}` is inside a {}", other.type_str())),
-        };
-    }
-    match at {
-        toml::Value::Table(table) => {
-            table.insert((*last).to_owned(), value);
-            Ok(())
-        }
-        other => Err(format!("`{last}` is inside a {}", other.type_str())),
-    }
 }
 
 fn one_line(error: &toml::de::Error) -> String {

@@ -70,8 +70,12 @@ pub enum SynthError {
     /// Too small or too large.
     #[error("size {0}x{1}: each side must be 8 to 4096 pixels")]
     Size(u32, u32),
-    /// Too fast, or not a number.
-    #[error("a turn of {0} radians during the readout: must be 0 to {most}", most = RollingShutter::MOST_TURNED)]
+    /// Too fast, or not a number; radians.
+    #[error(
+        "a turn of {:.1} degrees during the readout: must be 0 to {:.1}",
+        .0.to_degrees(),
+        RollingShutter::MOST_TURNED.to_degrees()
+    )]
     Turn(f32),
 }
 
@@ -331,6 +335,13 @@ mod tests {
             (
                 SynthOptions { height: 5000, ..SMALL },
                 "size 32x5000: each side must be 8 to 4096 pixels",
+            ),
+            (
+                SynthOptions {
+                    turn: 45f32.to_radians(),
+                    ..SMALL
+                },
+                "a turn of 45.0 degrees during the readout: must be 0 to 28.6",
             ),
         ];
         for (options, line) in cases {

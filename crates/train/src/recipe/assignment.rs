@@ -1,10 +1,17 @@
 //! Overrides of a recipe: `key=value`, where the key is a path such as `stage.grow.params.ssim_weight`.
 
+use std::num::IntErrorKind;
 use toml::{Table, Value};
 
 /// The keys and the value of an assignment. A value that is no TOML is a string.
 fn split(assignment: &str) -> Result<(Vec<&str>, Value), String> {
     let (path, value) = assignment.split_once('=').ok_or("expected key=value")?;
+    // TOML has no larger integers: this would be a string.
+    if let Err(error) = value.trim().parse::<i64>()
+        && matches!(error.kind(), IntErrorKind::PosOverflow | IntErrorKind::NegOverflow)
+    {
+        return Err(format!("an integer must be {} to {}", i64::MIN, i64::MAX));
+    }
     let value = format!("v = {value}")
         .parse::<Table>()
         .or_else(|_| format!("v = {value:?}").parse::<Table>())
@@ -98,6 +105,25 @@ mod tests {
         assert!(is_conditional(&[]));
         assert!(!is_conditional(&["params.opacity_reg=0.3"]));
         assert!(!is_conditional(&["params={opacity_reg=0.3}"]));
+    }
+
+    #[test]
+    fn an_integer_out_of_range_is_not_taken_for_a_string() {
+        for assignment in [
+            "visits=18446744073709551615",
+            "visits = -9223372036854775809",
+            "name=99999999999999999999",
+        ] {
+            let error = apply(&mut Value::Table(Table::new()), assignment).expect_err(assignment);
+            assert_eq!(error, "an integer must be -9223372036854775808 to 9223372036854775807");
+        }
+        for assignment in [
+            "visits=9223372036854775807",
+            "name=\"99999999999999999999\"",
+            "name=9e99",
+        ] {
+            apply(&mut Value::Table(Table::new()), assignment).expect(assignment);
+        }
     }
 
     #[test]

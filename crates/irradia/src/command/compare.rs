@@ -38,7 +38,7 @@ pub struct Args {
     pub data: Vec<PathBuf>,
     /// Recipes to compare, separated by commas: built-in or .toml files, each with overrides after colons, such as
     /// classic,fast:max_splats=50000
-    #[arg(long, value_name = "NAME[:KEY=VALUE]..", value_delimiter = ',', required = true)]
+    #[arg(long, value_name = "NAME[:KEY=VALUE]..", required = true)]
     pub recipes: Vec<String>,
     /// Runs of each recipe on each dataset, with the seeds 0, 1, ..
     #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u64).range(1..=1000))]
@@ -336,13 +336,14 @@ fn variants(args: &Args) -> Result<Vec<Variant>> {
     let eval_every = args.eval_every.or(args.steps.map(|steps| (steps / 40).max(1)));
     let eval_every = eval_every.unwrap_or(100);
     let mut variants = Vec::new();
-    for text in &args.recipes {
+    for text in args.recipes.iter().flat_map(|list| split_plain(list, ',')) {
         let (recipe, rest) = text.split_once(':').unwrap_or((text, ""));
         let mut overrides = vec![format!("eval_every={eval_every}")];
-        overrides.extend(rest.split(':').filter(|change| !change.is_empty()).map(str::to_owned));
+        let changes = split_plain(rest, ':').into_iter().filter(|change| !change.is_empty());
+        overrides.extend(changes.map(str::to_owned));
         let resolved = read_recipe(recipe, &overrides)?;
         variants.push(Variant {
-            text: text.clone(),
+            text: text.to_owned(),
             recipe: recipe.to_owned(),
             overrides,
             hash: resolved.hash(),
@@ -354,6 +355,28 @@ fn variants(args: &Args) -> Result<Vec<Variant>> {
         variant.folder = folder;
     }
     Ok(variants)
+}
+
+/// The parts of `text` between separators outside of brackets, braces and quotes.
+fn split_plain(text: &str, separator: char) -> Vec<&str> {
+    let (mut depth, mut quote, mut start) = (0i32, None, 0);
+    let mut parts = Vec::new();
+    for (at, c) in text.char_indices() {
+        match (c, quote) {
+            (_, Some(opened)) if c == opened => quote = None,
+            (_, Some(_)) => {}
+            ('"' | '\'', None) => quote = Some(c),
+            ('[' | '{', None) => depth += 1,
+            (']' | '}', None) => depth -= 1,
+            (_, None) if c == separator && depth <= 0 => {
+                parts.push(&text[start..at]);
+                start = at + c.len_utf8();
+            }
+            _ => {}
+        }
+    }
+    parts.push(&text[start..]);
+    parts
 }
 
 /// The last part of a path as the name of a folder, without characters that file systems may reject.
@@ -604,6 +627,35 @@ mod tests {
     struct Cli {
         #[command(flatten)]
         args: Args,
+    }
+
+    #[test]
+    fn recipes_are_separated_outside_of_values() {
+        for (list, parts) in [
+            (
+                "classic,fast:max_splats=50000",
+                &["classic", "fast:max_splats=50000"][..],
+            ),
+            (
+                "fast:render.background=[1,0,0],mcmc",
+                &["fast:render.background=[1,0,0]", "mcmc"],
+            ),
+            (
+                "fast:render={background=[1,0,0],antialias=true}",
+                &["fast:render={background=[1,0,0],antialias=true}"],
+            ),
+            ("fast:name='a, b',\"it's\",x", &["fast:name='a, b'", "\"it's\"", "x"]),
+            ("fast]},mcmc,", &["fast]}", "mcmc", ""]),
+        ] {
+            assert_eq!(split_plain(list, ','), parts);
+        }
+        let line = "compare chair --out x --recipes fast:render.background=[1,0,0]:name='a:b',classic";
+        let variants = variants(&Cli::parse_from(line.split(' ')).args).expect("recipes");
+        let changes = ["eval_every=100", "render.background=[1,0,0]", "name='a:b'"];
+        assert_eq!(
+            (variants.len(), &variants[0].overrides[..]),
+            (2, &changes.map(str::to_owned)[..])
+        );
     }
 
     #[test]

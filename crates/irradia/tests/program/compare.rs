@@ -153,6 +153,10 @@ fn mistakes_are_found_before_any_training() {
     let cases = [
         ("compare data --recipes nonsense --out both", "nonsense"),
         ("compare data --recipes classic,classic:no.such=1 --out both", "no"),
+        (
+            "compare data --recipes fast:render.background=[1,0,0],classic:no.such=1 --out both",
+            "`no`",
+        ),
         ("compare nowhere --recipes classic --out both", "nowhere"),
         ("compare data --recipes absent.toml --out both", "absent.toml"),
         ("compare data --recipes classic --out both --device abacus", "abacus"),

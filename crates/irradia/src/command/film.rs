@@ -174,7 +174,7 @@ impl Drop for FilmWriter {
 
 fn gif_encoder(path: &Path, width: u32, height: u32, fps: f32) -> Result<Encoder> {
     let file = File::create(path).with_context(|| format!("cannot create {}", path.display()))?;
-    // Sides are at most 16384, see `parse_size`.
+    // Sides are at most 16384, see `parse_frame_size`.
     let mut encoder = gif::Encoder::new(BufWriter::new(file), width as u16, height as u16, &[])?;
     encoder.set_repeat(gif::Repeat::Infinite)?;
     Ok(Encoder::Gif {

@@ -42,7 +42,7 @@ pub struct Args {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=240))]
     pub fps: Option<u32>,
     /// Size of the frames of --orbit and --path; when absent that of the training images, or 1280x720
-    #[arg(long, value_name = "WxH", value_parser = parse_size, conflicts_with = "data")]
+    #[arg(long, value_name = "WxH", value_parser = parse_frame_size, conflicts_with = "data")]
     pub size: Option<(u32, u32)>,
     /// Folder for the frames; with --orbit or --path also a film: .mp4 and .webm with ffmpeg, .gif without
     #[arg(long)]
@@ -66,12 +66,22 @@ pub struct Args {
 /// Frames of a path that is not read from a file: four seconds.
 const PATH_FRAMES: u32 = 120;
 
-/// `640x480`
+/// `640x480`, of any size: each command has its own limits.
 pub fn parse_size(text: &str) -> Result<(u32, u32), String> {
     text.split_once('x')
         .and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)))
-        .filter(|(w, h)| FRAME_SIDE.contains(w) && FRAME_SIDE.contains(h))
-        .ok_or_else(|| "expected a size such as 640x480, each side 1 to 16384".into())
+        .ok_or_else(|| "expected a size such as 640x480".into())
+}
+
+/// The size of a frame.
+fn parse_frame_size(text: &str) -> Result<(u32, u32), String> {
+    let (width, height) = parse_size(text)?;
+    if FRAME_SIDE.contains(&width) && FRAME_SIDE.contains(&height) {
+        Ok((width, height))
+    } else {
+        let (least, most) = (FRAME_SIDE.start(), FRAME_SIDE.end());
+        Err(format!("each side must be {least} to {most} pixels"))
+    }
 }
 
 pub fn run(args: &Args) -> Result<()> {

@@ -14,7 +14,7 @@ fn data_refused(folder: &Path, words: &[&str]) {
 #[test]
 fn command_line_mistakes_exit_with_2_and_change_nothing() {
     let folder = with_run();
-    let cases: [(&str, &[&str]); 28] = [
+    let cases: [(&str, &[&str]); 34] = [
         ("train", &["<DATA>"]),
         ("train data", &["--out"]),
         (
@@ -64,6 +64,18 @@ fn command_line_mistakes_exit_with_2_and_change_nothing() {
         ("render run --out x", &["--data", "--orbit"]),
         ("render run --orbit 0 --out x", &["--orbit"]),
         ("synth x --views 1", &["1 views"]),
+        ("synth x --size 0x5", &["size 0x5", "8 to 4096"]),
+        ("synth x --size large", &["--size", "640x480"]),
+        ("synth x --turn 90", &["90.0 degrees", "0 to 28.6"]),
+        ("render run --orbit 2 --size 0x5 --out x", &["--size", "1 to 16384"]),
+        (
+            "train data --out x --set visits=18446744073709551615",
+            &["visits=18446744073709551615", "9223372036854775807"],
+        ),
+        (
+            "train data --out x --set render.background=[5,-3,0]",
+            &["render.background", "0 to 1"],
+        ),
     ];
     for (line, words) in cases {
         let ended = irradia(folder.path(), line);

@@ -277,7 +277,7 @@ impl RunFolder {
     /// The dataset of the run that contains the scene `path`, if its photographs were posed for it.
     pub fn posed_dataset(path: &Path) -> Option<PathBuf> {
         let data = Self::record_containing(path).ok()??.input.data;
-        same_file(&data, &Self::containing(path)?.file(POSED_FOLDER)).then_some(data)
+        (data.exists() && same_file(&data, &Self::containing(path)?.file(POSED_FOLDER))).then_some(data)
     }
 
     /// Writes the list of training and held-out views.
@@ -330,6 +330,22 @@ impl RunFolder {
             dataset
                 .warnings
                 .push(format!("{missing} views that the run held out are not in the dataset"));
+        }
+        Ok(())
+    }
+
+    /// Adds a warning to `dataset` if the run was trained on views that it holds out.
+    ///
+    /// # Errors
+    /// When the run's list of views is damaged.
+    pub(crate) fn warn_of_trained_views(&self, dataset: &mut Dataset) -> Result<(), RunError> {
+        let trained = self.views()?.map_or(0, |views| views.trained_on(dataset));
+        if trained > 0 {
+            dataset.warnings.push(format!(
+                "{} was trained on {trained} of the {} held-out views, whose figures are therefore too good: omit --holdout to hold out its own",
+                self.0.display(),
+                dataset.test.len()
+            ));
         }
         Ok(())
     }

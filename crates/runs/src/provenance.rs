@@ -58,6 +58,13 @@ impl ViewList {
         Some(missing)
     }
 
+    /// How many of the views that `dataset` holds out were trained on, by their names.
+    pub fn trained_on(&self, dataset: &Dataset) -> usize {
+        let held_out = dataset.test.iter().map(|view| &dataset.views[*view].name);
+        let is_trained = |name: &&String| self.0.get(*name).is_some_and(|record| record.part == SplitPart::Train);
+        held_out.filter(is_trained).count()
+    }
+
     /// Differences from `now`: one phrase per kind of difference, each with the first view concerned.
     pub fn differences(&self, now: &Self) -> Vec<String> {
         let phrase = |what: &str, names: Vec<&String>| {

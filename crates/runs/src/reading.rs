@@ -187,9 +187,11 @@ impl ReadingOptions {
             }
         }
         let mut dataset = self.with_fallback(reading).read(data)?;
-        if let (None, Some(folder)) = (&self.holdout, RunFolder::containing(path)) {
+        match RunFolder::containing(path) {
             // The run was trained on all others.
-            folder.restore_holdout(&mut dataset)?;
+            Some(run) if self.holdout.is_none() => run.restore_holdout(&mut dataset)?,
+            Some(run) => run.warn_of_trained_views(&mut dataset)?,
+            None => {}
         }
         let (shown_path, shown_data) = (path.display(), data.display());
         match moved_from_dataset(&scene_path(path), &dataset) {

@@ -84,11 +84,12 @@ impl Run {
     /// Those of [`Run::begin`].
     pub fn begin_on(mut request: TrainRequest, mut dataset: Dataset) -> Result<Self, RunError> {
         let earlier = request.input.replay.as_ref().or(request.input.from.as_ref());
-        if let (Some(earlier), None) = (earlier, &request.input.reading.holdout)
-            && let Some(run) = RunFolder::containing(earlier)
-        {
+        match earlier.and_then(|earlier| RunFolder::containing(earlier)) {
             // The splats were trained on all others, or are to be trained again on the same ones.
-            run.restore_holdout(&mut dataset)?;
+            Some(run) if request.input.reading.holdout.is_none() => run.restore_holdout(&mut dataset)?,
+            // A replay has the split of its run.
+            Some(run) if request.input.from.is_some() => run.warn_of_trained_views(&mut dataset)?,
+            _ => {}
         }
         // Before unreadable photographs are left out below: once they are restored, they are held out again.
         let views = ViewList::of(&dataset);

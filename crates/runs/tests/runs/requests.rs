@@ -205,6 +205,32 @@ fn a_run_is_repeated_on_the_same_photographs_only() {
 }
 
 #[test]
+fn held_out_views_on_which_the_first_splats_were_trained_are_reported() {
+    let folder = folder();
+    let mut run = begin(folder.path(), "run", 3);
+    run.train(&mut []).expect("trains");
+    run.finish().expect("finishes");
+    let warnings = |holdout: Option<&str>| {
+        let mut input = TrainInput {
+            from: Some(folder.path().join("run")),
+            overwrite: true,
+            ..input(folder.path(), "continued", 3)
+        };
+        input.reading.holdout = holdout.map(str::to_owned);
+        let mut data = dataset();
+        std::mem::swap(&mut data.train, &mut data.test);
+        let run = Run::begin_on(input.check().expect("a request"), data).expect("a run");
+        run.trainer().dataset.warnings.join("\n")
+    };
+    assert!(
+        warnings(Some("5")).contains("4 of the 4 held-out views"),
+        "{}",
+        warnings(Some("5"))
+    );
+    assert!(!warnings(None).contains("held-out views"), "{}", warnings(None));
+}
+
+#[test]
 fn a_request_round_trips() {
     let folder = folder();
     let asked = TrainInput {

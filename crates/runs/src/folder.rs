@@ -113,6 +113,9 @@ pub struct RunRecord {
     /// Warnings about the dataset: what was found when it was read, and whether its poses were replaced.
     #[serde(default)]
     pub data_warnings: Vec<String>,
+    /// A hash of the scene with which the run began, if it continues one: a replay needs the same.
+    #[serde(default)]
+    pub from_fingerprint: Option<String>,
 }
 
 impl RunRecord {
@@ -407,7 +410,8 @@ impl RunFolder {
     }
 
     /// Writes `run.json`. A dataset in the folder itself is recorded relative to it, since the run may be moved.
-    pub(crate) fn write_record(&self, mut record: RunRecord) -> Result<(), RunError> {
+    pub(crate) fn write_record(&self, record: &RunRecord) -> Result<(), RunError> {
+        let mut record = record.clone();
         if let Ok(inside) = record.input.data.strip_prefix(absolute(self.0.clone()))
             && inside != Path::new("")
         {

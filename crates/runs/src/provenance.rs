@@ -1,6 +1,6 @@
 //! Fingerprints of a run's data and of the program, to detect changes.
 
-use crate::is_film_name;
+use crate::{RunError, is_film_name};
 use irradia_formats::is_image_name;
 use irradia_scene::{Dataset, Lens};
 use serde::{Deserialize, Serialize};
@@ -193,9 +193,18 @@ fn add_dataset(hash: &mut Hash, dataset: &Dataset) {
 /// # Errors
 /// When the file cannot be read.
 pub fn program_fingerprint() -> io::Result<String> {
+    Ok(hash_of(&fs::read(std::env::current_exe()?)?))
+}
+
+/// A hash of the content of the file `path`.
+pub(crate) fn file_fingerprint(path: &Path) -> Result<String, RunError> {
+    Ok(hash_of(&fs::read(path).map_err(RunError::io("read", path))?))
+}
+
+fn hash_of(bytes: &[u8]) -> String {
     let mut hash = Hash::new();
-    hash.add(&fs::read(std::env::current_exe()?)?);
-    Ok(hash.hex())
+    hash.add(bytes);
+    hash.hex()
 }
 
 #[cfg(test)]

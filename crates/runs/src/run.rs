@@ -4,10 +4,10 @@ use crate::evaluate::hold_out_readable;
 use crate::folder::{REPEATED_PACES, RunRecord};
 use crate::journal::Journal;
 use crate::lock::FolderLock;
-use crate::provenance::ViewList;
+use crate::provenance::{ViewList, file_fingerprint};
 use crate::scene_file::same_file;
 use crate::snapshot::{SnapshotServer, Snapshots};
-use crate::{RunError, RunFolder, SCENE, TrainRequest, background, moved_from_dataset};
+use crate::{RunError, RunFolder, SCENE, TrainRequest, background, moved_from_dataset, scene_path};
 use irradia_compute::{Device, DeviceChoice};
 use irradia_measure::Lpips;
 use irradia_scene::Dataset;
@@ -50,8 +50,8 @@ pub struct Run {
     paces: Option<Paces>,
     /// Seconds between the request and the first step.
     pub(crate) preparing: Option<f64>,
-    /// Warnings about the dataset, also those of earlier processes.
-    data_warnings: Vec<String>,
+    /// What `run.json` holds.
+    record: RunRecord,
     _lock: FolderLock,
 }
 
@@ -111,6 +111,20 @@ impl Run {
             let folder = RunFolder::at(repeated);
             check_same_data(&folder, folder.changed_views(&views)?, &request, &dataset)?;
         }
+        let from = request.input.from.as_deref().map(scene_path);
+        let from_fingerprint = from.as_deref().map(file_fingerprint).transpose()?;
+        if let (Some(repeated), Some(from)) = (&request.input.replay, &from)
+            && RunFolder::open(repeated)?
+                .1
+                .from_fingerprint
+                .is_some_and(|then| Some(then) != from_fingerprint)
+        {
+            return Err(RunError::Refused(format!(
+                "{} has changed since {} began with it: the run cannot be repeated",
+                from.display(),
+                repeated.display()
+            )));
+        }
         let existing_lock = FolderLock::acquire_existing(out)?;
         let paces = request.paces()?;
         let options = train_options(&request)?;
@@ -133,13 +147,14 @@ impl Run {
             folder.write(REPEATED_PACES, paces.to_text().as_bytes())?;
         }
         // Last: a folder with this file has everything needed to resume.
-        let data_warnings = trainer.dataset.warnings.clone();
-        folder.write_record(RunRecord {
+        let record = RunRecord {
             input: request.input.clone(),
             complete: false,
-            data_warnings: data_warnings.clone(),
-        })?;
-        Self::new(folder, lock, request, trainer, paces, data_warnings)
+            data_warnings: trainer.dataset.warnings.clone(),
+            from_fingerprint,
+        };
+        folder.write_record(&record)?;
+        Self::new(folder, lock, request, trainer, paces, record)
     }
 
     /// Resumes the run in the request's folder from its latest checkpoint. The request comes from
@@ -158,7 +173,7 @@ impl Run {
     /// # Errors
     /// Those of [`Run::resume`].
     pub fn resume_on(request: TrainRequest, mut dataset: Dataset) -> Result<Self, RunError> {
-        let (folder, record) = RunFolder::open(&request.input.out)?;
+        let (folder, mut record) = RunFolder::open(&request.input.out)?;
         let holdout = &request.input.reading.holdout;
         // A list, or the photographs of which every N-th is held out, may have changed since.
         if holdout.is_none() || *holdout == record.input.reading.holdout {
@@ -210,20 +225,12 @@ impl Run {
         folder.write_views(&views)?;
         // With what was changed to resume, should this process die.
         // Reading the dataset again repeats some of its warnings, but not what was found out about its poses.
-        let mut data_warnings = record.data_warnings;
-        let now = &trainer.dataset.warnings;
-        data_warnings.extend(
-            now.iter()
-                .filter(|line| !data_warnings.contains(line))
-                .cloned()
-                .collect::<Vec<_>>(),
-        );
-        folder.write_record(RunRecord {
-            input: request.input.clone(),
-            complete: record.complete,
-            data_warnings: data_warnings.clone(),
-        })?;
-        Self::new(folder, lock, request, trainer, paces, data_warnings)
+        let new = |line: &&String| !record.data_warnings.contains(line);
+        let new: Vec<String> = trainer.dataset.warnings.iter().filter(new).cloned().collect();
+        record.data_warnings.extend(new);
+        record.input = request.input.clone();
+        folder.write_record(&record)?;
+        Self::new(folder, lock, request, trainer, paces, record)
     }
 
     fn new(
@@ -232,11 +239,11 @@ impl Run {
         request: TrainRequest,
         trainer: Trainer,
         paces: Option<Paces>,
-        data_warnings: Vec<String>,
+        record: RunRecord,
     ) -> Result<Self, RunError> {
         let unseen_lpips = request.input.unseen_lpips.as_ref().map(Lpips::load).transpose()?;
         let mut journal = Journal::open(&folder, trainer.clock.step)?;
-        journal.warnings.extend(data_warnings.iter().cloned());
+        journal.warnings.extend(record.data_warnings.iter().cloned());
         journal.warnings.extend(request.warnings());
         Ok(Self {
             unseen_lpips,
@@ -247,7 +254,7 @@ impl Run {
             snapshots: SnapshotServer::new(),
             paces,
             preparing: None,
-            data_warnings,
+            record,
             _lock: lock,
         })
     }
@@ -336,10 +343,10 @@ impl Run {
         let report = report?;
         self.write_report(&report)?;
         let complete = self.trainer.finished();
-        self.folder.write_record(RunRecord {
+        self.folder.write_record(&RunRecord {
             input: self.request.input,
             complete,
-            data_warnings: self.data_warnings,
+            ..self.record
         })?;
         Ok(Finished {
             folder: self.folder,

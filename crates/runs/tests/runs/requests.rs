@@ -205,6 +205,27 @@ fn a_run_is_repeated_on_the_same_photographs_only() {
 }
 
 #[test]
+fn a_continued_scene_is_repeated_from_the_same_scene_only() {
+    let folder = folder();
+    for name in ["first", "continued"] {
+        let mut input = input(folder.path(), name, 3);
+        input.from = (name == "continued").then(|| folder.path().join("first"));
+        let mut run = Run::begin_on(input.check().expect("a request"), dataset()).expect("a run");
+        run.train(&mut []).expect("trains");
+        run.finish().expect("finishes");
+    }
+    let replay = |out: &str| {
+        let input = TrainInput::replay_of(folder.path().join("continued"), folder.path().join(out)).expect("a run");
+        Run::begin_on(input.check().expect("a request"), dataset())
+    };
+    assert!(replay("again").is_ok());
+    let first = folder.path().join("first/scene.ply");
+    std::fs::copy(folder.path().join("continued/scene.ply"), &first).expect("replaced");
+    let error = replay("other").err().expect("refused").to_string();
+    assert!(error.contains("first/scene.ply has changed since"), "{error}");
+}
+
+#[test]
 fn held_out_views_on_which_the_first_splats_were_trained_are_reported() {
     let folder = folder();
     let mut run = begin(folder.path(), "run", 3);

@@ -103,8 +103,8 @@ fn create_beside(path: &Path) -> io::Result<NamedTempFile> {
     builder.tempfile_in(folder_of(path).unwrap_or(Path::new(".")))
 }
 
-/// The folder of a file; `None` for a mere file name.
-fn folder_of(path: &Path) -> Option<&Path> {
+/// The folder of a file; `None` for a mere file name, which is in the current one.
+pub fn folder_of(path: &Path) -> Option<&Path> {
     path.parent().filter(|folder| !folder.as_os_str().is_empty())
 }
 

@@ -32,7 +32,7 @@ mod valid_region;
 mod xml;
 mod zip;
 
-pub use atomic::{StagedFile, write_atomic};
+pub use atomic::{StagedFile, folder_of, write_atomic};
 pub use dataset::colmap::{
     ColmapCamera, ColmapImage, ColmapModel, ColmapPoint, PosedImage, TrackedPoint, read_colmap_poses, write_colmap,
 };

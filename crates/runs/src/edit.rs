@@ -163,13 +163,10 @@ impl Editing {
             // Rendering needs these.
             let others = RENDERING.map(|name| (name, fs::read(self.path.with_file_name(name)).ok()));
             for (name, content) in iter::once(cameras).chain(others) {
-                let of_scene_before = folder.file(name);
                 match content {
                     Some(content) => folder.write(name, &content)?,
-                    None if of_scene_before.exists() => {
-                        fs::remove_file(&of_scene_before).map_err(RunError::io("remove", &of_scene_before))?;
-                    }
-                    None => {}
+                    // Of the scene before.
+                    None => folder.remove(name)?,
                 }
             }
             folder.write(EDITS, self.list.to_toml().as_bytes())?;

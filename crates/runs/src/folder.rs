@@ -401,7 +401,10 @@ impl RunFolder {
     }
 
     /// Removes the file `name`, if it exists.
-    pub(crate) fn remove(&self, name: &str) -> Result<(), RunError> {
+    ///
+    /// # Errors
+    /// When it cannot be removed.
+    pub fn remove(&self, name: &str) -> Result<(), RunError> {
         let path = self.file(name);
         match fs::remove_file(&path) {
             Err(error) if error.kind() != ErrorKind::NotFound => Err(RunError::io("remove", &path)(error)),

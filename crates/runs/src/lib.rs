@@ -99,7 +99,9 @@ pub use reading::{Reading, ReadingOptions};
 pub use request::{DEFAULT_RECIPE, HOW_TO_GET_LPIPS, TrainInput, TrainRequest, has_perceptual_loss, read_recipe};
 pub use results::write_image;
 pub use run::{Finished, Run, open_device};
-pub use scene_file::{Scene, check_not_overwritten, read_lights, read_vignette, residual_left_out, scene_path};
+pub use scene_file::{
+    Scene, check_not_overwritten, read_lights, read_vignette, residual_left_out, same_file, scene_path,
+};
 pub use snapshot::{Snapshot, Snapshots};
 pub use synth_files::{SynthSummary, write_synth_dataset};
 

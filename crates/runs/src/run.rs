@@ -107,23 +107,20 @@ impl Run {
                 from.display()
             )));
         }
-        if let Some(repeated) = &request.input.replay {
-            let folder = RunFolder::at(repeated);
-            check_same_data(&folder, folder.changed_views(&views)?, &request, &dataset)?;
-        }
         let from = request.input.from.as_deref().map(scene_path);
         let from_fingerprint = from.as_deref().map(file_fingerprint).transpose()?;
-        if let (Some(repeated), Some(from)) = (&request.input.replay, &from)
-            && RunFolder::open(repeated)?
-                .1
-                .from_fingerprint
-                .is_some_and(|then| Some(then) != from_fingerprint)
-        {
-            return Err(RunError::Refused(format!(
-                "{} has changed since {} began with it: the run cannot be repeated",
-                from.display(),
-                repeated.display()
-            )));
+        if let Some(repeated) = &request.input.replay {
+            let (folder, record) = RunFolder::open(repeated)?;
+            check_same_data(&folder, folder.changed_views(&views)?, &request, &dataset)?;
+            if let (Some(from), Some(then)) = (&from, record.from_fingerprint)
+                && from_fingerprint != Some(then)
+            {
+                return Err(RunError::Refused(format!(
+                    "{} has changed since {} began with it: the run cannot be repeated",
+                    from.display(),
+                    repeated.display()
+                )));
+            }
         }
         let existing_lock = FolderLock::acquire_existing(out)?;
         let paces = request.paces()?;
@@ -223,11 +220,11 @@ impl Run {
             return Err(RunError::setting("budget", budget, message));
         }
         folder.write_views(&views)?;
-        // With what was changed to resume, should this process die.
         // Reading the dataset again repeats some of its warnings, but not what was found out about its poses.
         let new = |line: &&String| !record.data_warnings.contains(line);
         let new: Vec<String> = trainer.dataset.warnings.iter().filter(new).cloned().collect();
         record.data_warnings.extend(new);
+        // With what was changed to resume, should this process die.
         record.input = request.input.clone();
         folder.write_record(&record)?;
         Self::new(folder, lock, request, trainer, paces, record)

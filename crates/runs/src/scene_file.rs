@@ -7,7 +7,7 @@ use crate::orbit::{OrbitGeometry, orbit, orbit_geometry};
 use crate::{RunError, RunFolder};
 use irradia_edit::Draft;
 use irradia_field::{Field, Sampler};
-use irradia_formats::{SplatFormat, is_sog_folder, read_splat_file};
+use irradia_formats::{SplatFormat, folder_of, is_sog_folder, read_splat_file};
 use irradia_scene::{Camera, Dataset, Similarity};
 use irradia_splat::{RenderOptions, Renderer, Splats};
 use irradia_train::lights::Lights;
@@ -142,7 +142,7 @@ pub fn check_not_overwritten(scene: &Path, output: &Path) -> Result<(), RunError
 }
 
 /// Whether both paths lead to the same file or folder, which may not exist yet.
-pub(crate) fn same_file(a: &Path, b: &Path) -> bool {
+pub fn same_file(a: &Path, b: &Path) -> bool {
     resolved(a) == resolved(b)
 }
 
@@ -151,14 +151,10 @@ fn resolved(path: &Path) -> PathBuf {
     if let Ok(resolved) = path.canonicalize() {
         return resolved;
     }
-    let Some(parent) = path.parent() else {
-        return path.to_owned();
+    let mut folder = match folder_of(path) {
+        Some(folder) => resolved(folder),
+        None => Path::new(".").canonicalize().unwrap_or_default(),
     };
-    let mut folder = resolved(if parent.as_os_str().is_empty() {
-        Path::new(".")
-    } else {
-        parent
-    });
     match path.components().next_back() {
         Some(Component::Normal(name)) => folder.push(name),
         Some(Component::ParentDir) => {

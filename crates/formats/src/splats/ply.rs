@@ -44,9 +44,9 @@ pub fn parse_splat_ply(bytes: &[u8]) -> Result<GaussianCloud, Malformed> {
     if ply.has(compressed_ply::CHUNK_ELEMENT) {
         return compressed_ply::parse(&ply);
     }
-    let sh_degree = check_properties(&ply)?;
+    let (sh_degree, are_colors) = check_properties(&ply)?;
     let rows = ply.rows("vertex")?;
-    let columns = Columns::find(&rows, sh_degree)?;
+    let columns = Columns::find(&rows, sh_degree, are_colors)?;
 
     let declared = parse_world(&ply)?;
     let world = declared.or_else(|| world_of_doubles(&rows, &columns));
@@ -208,8 +208,7 @@ struct Columns {
 }
 
 impl Columns {
-    fn find(rows: &Rows, sh_degree: u32) -> Result<Self, Malformed> {
-        let are_colors = rows.columns([DC_PROPERTIES[0]]).is_err();
+    fn find(rows: &Rows, sh_degree: u32, are_colors: bool) -> Result<Self, Malformed> {
         let mut sh = rows
             .columns(if are_colors { COLOR_PROPERTIES } else { DC_PROPERTIES })?
             .to_vec();
@@ -231,8 +230,9 @@ impl Columns {
     }
 }
 
-/// Checks, before the body is read, that no property is missing, naming all that are; returns the SH degree.
-fn check_properties(ply: &Ply) -> Result<u32, Malformed> {
+/// Checks, before the body is read, that no property is missing, naming all that are; returns the SH degree, and whether
+/// there are colours in place of harmonics.
+fn check_properties(ply: &Ply) -> Result<(u32, bool), Malformed> {
     let names: Vec<&str> = ply.property_names("vertex")?.collect();
     let rest = names.iter().filter(|name| name.starts_with("f_rest_")).count();
     let has = |name: &str| names.contains(&name);
@@ -258,6 +258,7 @@ fn check_properties(ply: &Ply) -> Result<u32, Malformed> {
     }
     (0..=MAX_DEGREE)
         .find(|degree| 3 * (sh::coefficients(*degree) - 1) == rest)
+        .map(|degree| (degree, are_colors))
         .ok_or_else(|| {
             Malformed(format!(
                 "{rest} f_rest properties match no spherical-harmonics degree; expected 0, 9, 24, 45 or 72"

@@ -24,7 +24,6 @@ use irradia_runs::{
 };
 use serde::{Deserialize, Serialize};
 use std::fs::{self, File};
-use std::io::ErrorKind;
 use std::iter;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -483,13 +482,8 @@ fn one_run(request: Request, folder: &Path, what: &str, stop: &AtomicBool) -> Re
     note(format_args!("{what} .."));
     fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
     // If the run ends early, what an earlier one left does not pass for its result.
-    for name in ["report.json", "run.json"] {
-        match fs::remove_file(folder.join(name)) {
-            Err(error) if error.kind() != ErrorKind::NotFound => {
-                return Err(error).with_context(|| format!("cannot remove {}", folder.join(name).display()));
-            }
-            _ => {}
-        }
+    if let Some(earlier) = RunFolder::containing(folder) {
+        earlier.remove("run.json")?;
     }
     let bytes = serde_json::to_vec_pretty(&request)?;
     write_atomic(&folder.join(REQUEST_FILE), |out| out.write_all(&bytes))?;

@@ -7,7 +7,7 @@ use crate::Usage;
 use crate::terminal::{note, print_line};
 use anyhow::Result;
 use irradia_runs::synth::{SceneName, SynthLens, SynthOptions};
-use irradia_runs::{RunFolder, TrainInput, write_synth_dataset};
+use irradia_runs::{RunFolder, TrainInput, same_file, write_synth_dataset};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -95,10 +95,9 @@ fn check_replaceable(data: &Path, run: &Path) -> Result<()> {
         .iter()
         .all(|name| data.join(name).exists());
     let record = RunFolder::record_containing(run)?;
-    let is_own = |trained_on: PathBuf| trained_on.canonicalize().ok() == data.canonicalize().ok();
     let foreign = if !is_empty && !is_traced {
         data
-    } else if record.is_some_and(|record| !is_own(record.input.data)) {
+    } else if record.is_some_and(|record| !same_file(&record.input.data, data)) {
         run
     } else {
         return Ok(());

@@ -7,7 +7,7 @@ use crate::terminal::{note, print_line};
 use anyhow::{Context, Result};
 use irradia_edit::{Edit, EditList, Shape};
 use irradia_runs::formats::{SplatFormat, WriteOptions, write_atomic};
-use irradia_runs::{AppliedEdit, Editing};
+use irradia_runs::{AppliedEdit, Editing, same_file};
 use std::path::{Path, PathBuf};
 
 #[derive(clap::Args)]
@@ -125,7 +125,7 @@ pub fn run(args: &Args) -> Result<()> {
 /// Rejects a list of edits that would replace a scene that is read or written.
 fn check_list(path: &Path, args: &Args, editing: &Editing) -> Result<()> {
     editing.check_output(path)?;
-    if args.out.as_ref().is_some_and(|out| out == path) || SplatFormat::of(path).is_ok() {
+    if args.out.as_ref().is_some_and(|out| same_file(out, path)) || SplatFormat::of(path).is_ok() {
         return Err(Usage(format!(
             "--save-edits {}: name a file that is not a scene's, such as edits.toml",
             path.display()

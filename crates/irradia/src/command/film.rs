@@ -2,6 +2,7 @@
 
 use crate::Usage;
 use anyhow::{Context, Result, anyhow, bail};
+use irradia_runs::formats::folder_of;
 use irradia_runs::scene::Image;
 use std::fs::{self, File};
 use std::io::{BufWriter, Write};
@@ -82,8 +83,7 @@ impl FilmWriter {
             ))
             .into());
         }
-        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
-        if let Some(folder) = folder {
+        if let Some(folder) = folder_of(path) {
             fs::create_dir_all(folder).with_context(|| format!("cannot create {}", folder.display()))?;
         }
         let unfinished = path.with_file_name(format!(".{name}.{}.tmp", std::process::id()));

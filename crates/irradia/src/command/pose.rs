@@ -6,7 +6,7 @@ use crate::terminal::{note, print_line};
 use anyhow::{Context, Result};
 use clap::builder::RangedU64ValueParser;
 use indicatif::{ProgressBar, ProgressStyle};
-use irradia_runs::formats::{DatasetFormat, write_atomic};
+use irradia_runs::formats::{DatasetFormat, folder_of, write_atomic};
 use irradia_runs::scene::Dataset;
 use irradia_runs::{
     Finding, KnownDistance, MIN_POSED_FRACTION, Mapper, POSED_FOLDER, PoseInput, PoseProgress, PoseReport, TrainInput,
@@ -212,10 +212,7 @@ pub fn photo_folder(input: &TrainInput) -> PathBuf {
     match &input.reading.images {
         Some(images) => images.clone(),
         // A file that describes the dataset; the folder of a bare name is the current one.
-        None if input.data.is_file() => match input.data.parent() {
-            Some(folder) if !folder.as_os_str().is_empty() => folder.to_owned(),
-            _ => PathBuf::from("."),
-        },
+        None if input.data.is_file() => folder_of(&input.data).unwrap_or(Path::new(".")).to_owned(),
         None => input.data.clone(),
     }
 }

@@ -312,24 +312,25 @@ fn with_poses_of(from: &Path, mut input: TrainInput, poses: Option<PosesArg>) ->
 fn with_poses(input: TrainInput, poses: Option<PosesArg>, anyway: bool) -> Result<(TrainRequest, Dataset)> {
     let mut given = read(input.clone()).map_err(|error| naming_photographs(error, &input))?;
     RunFolder::check_free(&input.out, input.overwrite)?;
-    given.0.check_resources().map_err(with_option_names)?;
     // Rendered scenes are exact, and our own poses have been checked.
     let is_sure = || is_rendered(&given.1) || pose_source(&input.data) == Some(PoseSource::Irradia);
-    match poses.map(PosesArg::mapper) {
-        Some(Some(mapper)) => {
-            let mut again = input;
-            match mostly_unposed(&again, &given.1) {
-                Some(files) => {
-                    let photos = photo_folder(&again);
-                    pose_all(&mut again, &photos, Some(files), mapper, anyway)?;
-                }
-                None => pose_again(&mut again, &given.1, mapper, anyway)?,
-            }
-            return read(again);
-        }
+    let mapper = match poses.map(PosesArg::mapper) {
         Some(None) => return Ok(given),
         None if is_sure() => return Ok(given),
-        None => {}
+        mapper => mapper.flatten(),
+    };
+    // What follows takes a while.
+    given.0.check_resources().map_err(with_option_names)?;
+    if let Some(mapper) = mapper {
+        let mut again = input;
+        match mostly_unposed(&again, &given.1) {
+            Some(files) => {
+                let photos = photo_folder(&again);
+                pose_all(&mut again, &photos, Some(files), mapper, anyway)?;
+            }
+            None => pose_again(&mut again, &given.1, mapper, anyway)?,
+        }
+        return read(again);
     }
     if let Some(files) = mostly_unposed(&input, &given.1)
         && let Some(found) = pose_others(input.clone(), &mut given.1, files)

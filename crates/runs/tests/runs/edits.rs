@@ -1,6 +1,6 @@
 //! Edited scenes on disk, and runs that begin with them.
 
-use crate::{SMALL, begin, dataset, folder, input};
+use crate::{SMALL, begin, dataset, finished, folder, input};
 use glam::{Quat, Vec3};
 use irradia_edit::EditList;
 use irradia_runs::formats::{WriteOptions, read_splats, write_splats};
@@ -38,9 +38,7 @@ fn held_out_psnr(scene: &Scene, data: &Dataset) -> Result<f64, RunError> {
 #[test]
 fn a_folder_gets_the_scene_its_moved_cameras_and_the_edits() {
     let folder = folder();
-    let mut run = begin(folder.path(), "run", 5);
-    run.train(&mut []).expect("trains");
-    run.finish().expect("finishes");
+    finished(folder.path(), "run", 5);
     let (path, out) = (folder.path().join("run"), folder.path().join("out"));
     let editing = edited(&path, &["rotate axis=1,2,0 degrees=40", "move by=0,0,3"]);
     editing.write(&out, &WriteOptions::default()).expect("writes");
@@ -101,9 +99,7 @@ fn a_folder_gets_the_scene_its_moved_cameras_and_the_edits() {
 #[test]
 fn what_is_split_off_and_merged_again_is_the_same_scene() {
     let folder = folder();
-    let mut run = begin(folder.path(), "run", 5);
-    run.train(&mut []).expect("trains");
-    run.finish().expect("finishes");
+    finished(folder.path(), "run", 5);
     let path = folder.path().join("run");
     let out = folder.path().join("rest.ply");
     let editing = edited(&path, &["split name=part half-space point=0,0,0.5 normal=0,0,1"]);
@@ -273,9 +269,7 @@ fn a_run_edited_in_place_resumes_with_the_edited_splats() {
 #[test]
 fn a_training_begins_with_the_splats_of_a_scene() {
     let folder = folder();
-    let mut run = begin(folder.path(), "run", 30);
-    run.train(&mut []).expect("trains");
-    let first = run.finish().expect("finishes").report;
+    let first = finished(folder.path(), "run", 30).report;
     let from = TrainInput {
         from: Some(folder.path().join("run")),
         ..input(folder.path(), "next", 1)

@@ -53,11 +53,16 @@ fn begin(folder: &Path, name: &str, steps: u64) -> Run {
     Run::begin_on(request, dataset()).expect("a run")
 }
 
+/// The result of a run of `steps` steps in `folder/name`.
+fn finished(folder: &Path, name: &str, steps: u64) -> Finished {
+    let mut run = begin(folder, name, steps);
+    run.train(&mut []).expect("trains");
+    run.finish().expect("finishes")
+}
+
 /// The bytes of the scene of a run of `steps` steps without observers.
 fn unwatched(folder: &Path, steps: u64) -> Vec<u8> {
-    let mut run = begin(folder, "unwatched", steps);
-    run.train(&mut []).expect("trains");
-    assert!(run.finish().expect("finishes").complete);
+    assert!(finished(folder, "unwatched", steps).complete);
     scene(folder, "unwatched")
 }
 

@@ -1,6 +1,6 @@
 //! Requests: validation, and their storage in a run's folder.
 
-use crate::{begin, dataset, folder, input, scene};
+use crate::{begin, dataset, finished, folder, input, scene};
 use irradia_runs::formats::Lenses;
 use irradia_runs::prelude::*;
 use irradia_runs::{ReadingOptions, RunRecord, read_recipe};
@@ -152,9 +152,7 @@ fn an_existing_run_is_replaced_only_on_request() {
 #[test]
 fn a_replaced_run_leaves_the_files_of_others() {
     let folder = folder();
-    let mut run = begin(folder.path(), "run", 3);
-    run.train(&mut []).expect("trains");
-    run.finish().expect("finishes");
+    finished(folder.path(), "run", 3);
     let others = ["eval/notes.txt", "checkpoints/other.ckpt"].map(|name| folder.path().join("run").join(name));
     others
         .iter()
@@ -180,9 +178,7 @@ fn a_replaced_run_leaves_the_files_of_others() {
 #[test]
 fn a_run_is_repeated_on_the_same_photographs_only() {
     let folder = folder();
-    let mut run = begin(folder.path(), "run", 5);
-    run.train(&mut []).expect("trains");
-    run.finish().expect("finishes");
+    finished(folder.path(), "run", 5);
     let replay = |out: &str| {
         let input = TrainInput::replay_of(folder.path().join("run"), folder.path().join(out)).expect("a run");
         input.check().expect("a request")
@@ -228,9 +224,7 @@ fn a_continued_scene_is_repeated_from_the_same_scene_only() {
 #[test]
 fn held_out_views_on_which_the_first_splats_were_trained_are_reported() {
     let folder = folder();
-    let mut run = begin(folder.path(), "run", 3);
-    run.train(&mut []).expect("trains");
-    run.finish().expect("finishes");
+    finished(folder.path(), "run", 3);
     let warnings = |holdout: Option<&str>| {
         let mut input = TrainInput {
             from: Some(folder.path().join("run")),

@@ -1,6 +1,6 @@
 //! Scenes from files and runs.
 
-use crate::{begin, folder};
+use crate::{finished, folder};
 use irradia_runs::prelude::*;
 use irradia_runs::train::eval::{EvalOptions, Metrics};
 use irradia_runs::train::half_fit::HalfFit;
@@ -10,9 +10,7 @@ use std::fs;
 #[test]
 fn a_scene_takes_background_and_cameras_from_its_run_if_it_has_one() {
     let folder = folder();
-    let mut run = begin(folder.path(), "run", 3);
-    run.train(&mut []).expect("trains");
-    run.finish().expect("finishes");
+    finished(folder.path(), "run", 3);
     let path = folder.path().join("run");
     let inside = Scene::read(&path).expect("a scene");
     let cameras = inside.cameras.clone().expect("beside it");
@@ -55,9 +53,7 @@ fn a_scene_takes_background_and_cameras_from_its_run_if_it_has_one() {
 #[test]
 fn the_mean_of_an_evaluation_is_that_of_its_views() {
     let folder = folder();
-    let mut run = begin(folder.path(), "run", 3);
-    run.train(&mut []).expect("trains");
-    let report = run.finish().expect("finishes").report;
+    let report = finished(folder.path(), "run", 3).report;
     let scene = Scene::read(folder.path().join("run")).expect("a scene");
     let dataset = crate::dataset();
     let mut psnr = Vec::new();

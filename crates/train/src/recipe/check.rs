@@ -3,6 +3,33 @@
 use super::param::check_knob;
 use super::{AdamSettings, DensityControl, Exit, MergeSettings, Recipe, Represents};
 
+/// A number of a recipe: its key, its value, whether it is in range, and the range in words.
+pub(super) type Checked = (&'static str, f32, bool, &'static str);
+
+pub(super) fn at_least_one(key: &'static str, steps: u64) -> Checked {
+    (key, steps as f32, steps >= 1, "1 or more")
+}
+
+pub(super) fn not_negative(key: &'static str, value: f32) -> Checked {
+    (key, value, value >= 0.0, "0 or more")
+}
+
+pub(super) fn opacity(key: &'static str, value: f32) -> Checked {
+    (key, value, (0.0..1.0).contains(&value), "at least 0 and below 1")
+}
+
+pub(super) fn reset_to(value: f32) -> Checked {
+    ("reset_to", value, value > 0.0 && value < 1.0, "above 0 and below 1")
+}
+
+/// Names the first number that is out of range.
+pub(super) fn check(values: &[Checked]) -> Result<(), String> {
+    match values.iter().find(|(_, _, is_valid, _)| !is_valid) {
+        Some((key, value, _, range)) => Err(format!("{key} is {value}: it must be {range}")),
+        None => Ok(()),
+    }
+}
+
 impl Recipe {
     /// Checks every value.
     ///
@@ -30,14 +57,11 @@ impl Recipe {
         if self.max_splats == 0 || self.eval_every == 0 || self.checkpoint_every == 0 {
             return Err("max_splats, eval_every and checkpoint_every must be at least 1".into());
         }
-        let lengths = [
-            ("free_space", self.free_space),
-            ("extent_pixels", self.extent_pixels),
-            ("length_exponent", self.length_exponent),
-        ];
-        if let Some((name, value)) = lengths.iter().find(|(_, value)| *value < 0.0) {
-            return Err(format!("{name} is {value}: it must be 0 or more"));
-        }
+        check(&[
+            not_negative("free_space", self.free_space),
+            not_negative("extent_pixels", self.extent_pixels),
+            not_negative("length_exponent", self.length_exponent),
+        ])?;
         if let Some(value) = self.splats_per_pixel.filter(|value| *value <= 0.0) {
             return Err(format!(
                 "splats_per_pixel is {value}: it must be above 0, or absent for no such limit"

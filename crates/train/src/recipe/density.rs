@@ -1,5 +1,6 @@
 //! How a stage adds, removes and merges splats: the parameters of each strategy, with sizes in units of the scene's extent.
 
+use super::check::{Checked, at_least_one, check, not_negative, opacity, reset_to};
 use super::keys::documented;
 use irradia_splat::Statistics;
 use irradia_splat::densify::classic::ClassicOptions;
@@ -9,31 +10,14 @@ use irradia_splat::densify::merge::MergeOptions;
 use irradia_splat::densify::taming::{ScoreWeights, TamingOptions};
 use serde::{Deserialize, Serialize};
 
-/// A number of a recipe: its key, its value, whether it is in range, and the range in words.
-type Checked = (&'static str, f32, bool, &'static str);
-
-fn at_least_one(key: &'static str, steps: u64) -> Checked {
-    (key, steps as f32, steps >= 1, "1 or more")
-}
-
-fn not_negative(key: &'static str, value: f32) -> Checked {
-    (key, value, value >= 0.0, "0 or more")
-}
-
-fn opacity(key: &'static str, value: f32) -> Checked {
-    (key, value, (0.0..1.0).contains(&value), "at least 0 and below 1")
-}
-
-fn reset_to(value: f32) -> Checked {
-    ("reset_to", value, value > 0.0 && value < 1.0, "above 0 and below 1")
-}
-
-/// Names the first number that is out of range.
-fn check(values: &[Checked]) -> Result<(), String> {
-    match values.iter().find(|(_, _, is_valid, _)| !is_valid) {
-        Some((key, value, _, range)) => Err(format!("{key} is {value}: it must be {range}")),
-        None => Ok(()),
-    }
+/// The settings that 3DGS and Taming 3DGS share.
+fn by_gradient(gradient_threshold: f32, small: f32, max_scale: f32, opacity: f32) -> [Checked; 4] {
+    [
+        not_negative("gradient_threshold", gradient_threshold),
+        not_negative("small", small),
+        not_negative("max_scale", max_scale),
+        reset_to(opacity),
+    ]
 }
 
 /// A strategy.
@@ -63,43 +47,42 @@ impl DensityControl {
 
     /// Checks that every number is in range.
     pub(super) fn validate(&self) -> Result<(), String> {
+        let min_opacity = match self {
+            DensityControl::Classic(settings) => settings.min_opacity,
+            DensityControl::Mcmc(settings) => settings.min_opacity,
+            DensityControl::Taming(settings) => settings.min_opacity,
+            DensityControl::Fast(settings) => settings.min_opacity,
+        };
+        check(&[at_least_one("every", self.every()), opacity("min_opacity", min_opacity)])?;
         match self {
-            DensityControl::Classic(settings) => check(&[
-                at_least_one("every", settings.every),
-                not_negative("gradient_threshold", settings.gradient_threshold),
-                not_negative("small", settings.small),
-                opacity("min_opacity", settings.min_opacity),
-                not_negative("max_scale", settings.max_scale),
-                reset_to(settings.reset_to),
-            ]),
-            DensityControl::Mcmc(settings) => check(&[
-                at_least_one("every", settings.every),
-                ("growth", settings.growth, settings.growth >= 1.0, "1 or more"),
-                opacity("min_opacity", settings.min_opacity),
-            ]),
-            DensityControl::Taming(settings) => check(&[
-                at_least_one("every", settings.every),
-                not_negative("gradient_threshold", settings.gradient_threshold),
-                not_negative("small", settings.small),
-                opacity("min_opacity", settings.min_opacity),
-                not_negative("max_scale", settings.max_scale),
-                reset_to(settings.reset_to),
-                (
-                    "edge_share",
-                    settings.edge_share,
-                    (0.0..=1.0).contains(&settings.edge_share),
-                    "0 to 1",
-                ),
-                not_negative("score_gradient", settings.score_gradient),
-                not_negative("score_error", settings.score_error),
-                not_negative("score_weight", settings.score_weight),
-                not_negative("score_opacity", settings.score_opacity),
-                not_negative("score_extent", settings.score_extent),
-                not_negative("score_volume", settings.score_volume),
-            ]),
+            DensityControl::Classic(settings) => check(&by_gradient(
+                settings.gradient_threshold,
+                settings.small,
+                settings.max_scale,
+                settings.reset_to,
+            )),
+            DensityControl::Mcmc(settings) => {
+                check(&[("growth", settings.growth, settings.growth >= 1.0, "1 or more")])
+            }
+            DensityControl::Taming(settings) => {
+                check(&by_gradient(
+                    settings.gradient_threshold,
+                    settings.small,
+                    settings.max_scale,
+                    settings.reset_to,
+                ))?;
+                let edges = settings.edge_share;
+                check(&[
+                    ("edge_share", edges, (0.0..=1.0).contains(&edges), "0 to 1"),
+                    not_negative("score_gradient", settings.score_gradient),
+                    not_negative("score_error", settings.score_error),
+                    not_negative("score_weight", settings.score_weight),
+                    not_negative("score_opacity", settings.score_opacity),
+                    not_negative("score_extent", settings.score_extent),
+                    not_negative("score_volume", settings.score_volume),
+                ])
+            }
             DensityControl::Fast(settings) => check(&[
-                at_least_one("every", settings.every),
-                opacity("min_opacity", settings.min_opacity),
                 not_negative("min_weight", settings.min_weight),
                 not_negative("error_threshold", settings.error_threshold),
                 not_negative("min_extent", settings.min_extent),
